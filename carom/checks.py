@@ -1,0 +1,36 @@
+"""Checks of arguments: what is wrong is said at once, by name, where the values are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from carom.errors import CaromError
+
+
+def is_known(*values) -> bool:
+    """Whether no value is being traced, so that it can be looked at."""
+    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
+
+
+def as_floats(value) -> jax.Array:
+    """`value` as a floating-point array of the default precision, or of its own."""
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
+        return value
+    return jnp.asarray(value, dtype=jnp.zeros((), float).dtype)
+
+
+def require_values(name: str, value, condition, wanted: str) -> None:
+    """Raise unless `condition` holds everywhere; traced values pass, they cannot be looked at."""
+    if is_known(value, condition) and not np.all(np.asarray(condition)):
+        raise CaromError(f"{name} must be {wanted}; it was {_show(value)}.")
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise `CaromError(message)` unless `condition`."""
+    if not condition:
+        raise CaromError(message)
+
+
+def _show(value) -> str:
+    array = np.asarray(value)
+    return str(array.item() if array.ndim == 0 else array.tolist() if array.size <= 12 else f"of shape {array.shape}")

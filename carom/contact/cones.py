@@ -1,0 +1,560 @@
+r"""Friction-cone problems: a batched interior-point solver and its derivative. Arrays only.
+
+The problem, for each of a batch of `B` independent sets of `K` contacts in `d` = 2 or 3 dimensions (paper, eqs. 5
+and 7, appendix C):
+
+    minimise  1/2 f^T A f + f^T v    subject to   |f_t,i| <= mu_i f_n,i,   f_n,i >= lower_i
+
+with `f = (f_n, f_t)` stacked by contact and the normal component first. See `solve_cone_problem`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from carom.contact.linalg import Cholesky
+
+# --- The method -------------------------------------------------------------------------------------------------
+#
+# Variables. With f_t = mu g_t the friction cone becomes the standard second-order cone |g_t| <= f_n for every mu,
+# also mu = 0, where the tangent leaves the objective. So y = (f_n, g_t), f = S y, S = diag(1, mu, mu), Q = S A S,
+# q = S v. Each contact is scaled by 1 / sqrt(A_nn) (mass ratios then do not matter) and the whole problem by its
+# largest datum. The cone slack is s = y, the bound's slack u = y_n - lower; their multipliers are z and w.
+#
+#     Q y + q = z + e_n w,    s o z = 0,    u w = 0,    s, z in the cone,  u, w >= 0
+#
+# Where A is singular the impulse is not unique. A diagonal delta I added to A (before the scaling, so that the norm
+# is that of the impulse itself) selects the solution of least norm as delta -> 0.
+#
+# Steps are Mehrotra's predictor-corrector with Nesterov-Todd scaling W (W z = W^-1 s): (Q + W^-2 + D) dy = rhs. The
+# eigenvectors of W^-2 are known: p = (1, u)/sqrt 2, m = (1, -u)/sqrt 2 and, in 3D, the tangent across u. In that frame
+# W^-2 is diagonal, with entries that near the solution differ by 1e15; formed in the original frame it would
+# lose the small ones to rounding, in this frame it does not.
+
+
+class ConeSettings(NamedTuple):
+    """Knobs of the interior-point method; all are relative to the problem's own scale.
+
+    `tolerance` is the largest residual of the optimality conditions (stationarity, complementarity) at which a problem
+    counts as solved. `target` is the residual at which its iterations stop. `diagonal` is delta / mean(diag A).
+    `smoothing` stops at that value of the complementarity products instead of at `target`, which smooths the
+    derivative across the transitions between sticking, sliding and separating.
+    """
+
+    tolerance: float
+    target: float
+    diagonal: float
+    smoothing: float = 0.0
+    max_iterations: int = 40
+
+    @classmethod
+    def for_dtype(cls, dtype, smoothing: float = 0.0) -> "ConeSettings":
+        """Settings that suit problems whose data were computed in `dtype`."""
+        if dtype == jnp.float64:
+            return cls(tolerance=1e-8, target=1e-14, diagonal=1e-9, smoothing=smoothing)
+        return cls(tolerance=1e-4, target=1e-6, diagonal=1e-5, smoothing=smoothing)
+
+
+class _Problem(NamedTuple):
+    """A batch of scaled problems, batch last."""
+
+    Q: Float[Array, "n n B"]
+    q: Float[Array, "K d B"]
+    lower: Float[Array, "K B"]
+
+
+class _Iterate(NamedTuple):
+    y: Float[Array, "K d B"]  # scaled impulse = slack of the cone
+    u: Float[Array, "K B"]  # slack of the bound
+    z: Float[Array, "K d B"]  # multiplier of the cone
+    w: Float[Array, "K B"]  # multiplier of the bound
+
+
+def _dot(a, b):
+    return jnp.sum(a * b, axis=1)
+
+
+def _det(x):
+    """`x_0^2 - |x_1|^2`: positive inside the second-order cone."""
+    norm = jnp.sqrt(_dot(x[:, 1:], x[:, 1:]))
+    return (x[:, 0] - norm) * (x[:, 0] + norm)
+
+
+def _jordan_product(a, b):
+    return jnp.concatenate([_dot(a, b)[:, None], a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:]], axis=1)
+
+
+def _jordan_divide(a, b):
+    """The `x` with `a o x = b`."""
+    x0 = (a[:, 0] * b[:, 0] - _dot(a[:, 1:], b[:, 1:])) / _det(a)
+    return jnp.concatenate([x0[:, None], (b[:, 1:] - x0[:, None] * a[:, 1:]) / a[:, :1]], axis=1)
+
+
+class _Scaling(NamedTuple):
+    """Nesterov-Todd scaling of each cone, by the eigenvectors of `W` and the eigenvalues of `W^-1`."""
+
+    direction: Float[Array, "K t B"]
+    inverse: Float[Array, "K d B"]
+
+    @classmethod
+    def of(cls, s, z):
+        det_s, det_z = _det(s), _det(z)
+        s_bar, z_bar = s / jnp.sqrt(det_s)[:, None], z / jnp.sqrt(det_z)[:, None]
+        gamma = jnp.sqrt((1 + _dot(s_bar, z_bar)) / 2)
+        tangent = (s_bar[:, 1:] - z_bar[:, 1:]) / (2 * gamma[:, None])
+        norm = jnp.sqrt(_dot(tangent, tangent))
+        omega = jnp.sqrt(1 + norm**2) + norm
+        default = jnp.zeros_like(tangent).at[:, 0].set(1)
+        safe = norm[:, None] > 1e-30
+        direction = jnp.where(safe, tangent / jnp.where(safe, norm[:, None], 1), default)
+        inverse_beta = jnp.sqrt(jnp.sqrt(det_z / det_s))
+        entries = [inverse_beta / omega, inverse_beta * omega, inverse_beta][: s.shape[1]]
+        return cls(direction, jnp.stack(entries, axis=1))
+
+    def rotate(self, x: Float[Array, "K d *rest B"]):
+        """Components of `x` along the eigenvectors p, m and (in 3D) the cross tangent."""
+        extra = (1,) * (x.ndim - 3)
+        u = self.direction.reshape(*self.direction.shape[:2], *extra, -1)
+        root = jnp.asarray(0.5, x.dtype) ** 0.5
+        along = jnp.sum(u * x[:, 1:], axis=1)
+        parts = [root * (x[:, 0] + along), root * (x[:, 0] - along)]
+        if x.shape[1] == 3:
+            parts.append(u[:, 0] * x[:, 2] - u[:, 1] * x[:, 1])
+        return jnp.stack(parts, axis=1)
+
+    def restore(self, x: Float[Array, "K d *rest B"]):
+        """The inverse of `rotate`."""
+        extra = (1,) * (x.ndim - 3)
+        u = self.direction.reshape(*self.direction.shape[:2], *extra, -1)
+        root = jnp.asarray(0.5, x.dtype) ** 0.5
+        normal = root * (x[:, 0] + x[:, 1])
+        along = root * (x[:, 0] - x[:, 1])
+        parts = [normal, u[:, 0] * along]
+        if x.shape[1] == 3:
+            parts = [normal, u[:, 0] * along - u[:, 1] * x[:, 2], u[:, 1] * along + u[:, 0] * x[:, 2]]
+        return jnp.stack(parts, axis=1)
+
+
+def _matvec(Q, y):
+    return jnp.sum(Q * y.reshape(1, -1, y.shape[-1]), axis=1).reshape(y.shape)
+
+
+def _add_normal(x, normal):
+    return x.at[:, 0].add(normal)
+
+
+class _NewtonMatrix:
+    """`Q + W^-2 + D e_n e_n^T`, factored, each contact in the frame in which its own block loses nothing to rounding.
+
+    That is the frame of the scaling's eigenvectors, unless the bound holds the contact harder than the cone does:
+    then it is the original one, in which `D` is a single entry.
+    """
+
+    def __init__(self, problem: _Problem, it: _Iterate, scaling: _Scaling):
+        k, d, batch = it.y.shape
+        curvature = it.w / it.u
+        self.scaling = scaling
+        self.rotated = jnp.max(scaling.inverse, axis=1) ** 2 > curvature
+        H = problem.Q.reshape(k, d, k * d, batch)
+        H = self.rotate(H).reshape(k * d, k * d, batch).swapaxes(0, 1)
+        H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
+        # The contact's own block is W^-2 + D e_n e_n^T = (sum_j a_j r_j r_j^T) + D e_n e_n^T in either frame, with r_j
+        # the eigenvectors and a_j the eigenvalues.
+        eye = jnp.broadcast_to(jnp.eye(d, dtype=H.dtype)[None, :, :, None], (k, d, d, batch))
+        rotated = self.rotated[:, None, None]
+        eigenvectors = jnp.where(rotated, eye, scaling.restore(eye))  # [:, :, j] = r_j
+        normal = self.rotate(eye[:, :, 0])
+        block = jnp.sum(
+            (scaling.inverse**2)[:, None, None] * eigenvectors[:, :, None] * eigenvectors[:, None], axis=3
+        )
+        block = block + curvature[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        index = jnp.arange(k)
+        H = H.at[index, :, index].add(block)
+        self.factor = Cholesky(H.reshape(k * d, k * d, batch))
+
+    def rotate(self, x: Float[Array, "K d *m B"]):
+        rotated = self.rotated.reshape(x.shape[0], *(1,) * (x.ndim - 2), -1)
+        return jnp.where(rotated, self.scaling.rotate(x), x)
+
+    def solve(self, rhs: Float[Array, "K d *m B"]) -> Float[Array, "K d *m B"]:
+        flat = self.rotate(rhs).reshape(-1, *rhs.shape[2:])
+        x = self.factor.solve(flat).reshape(rhs.shape)
+        rotated = self.rotated.reshape(x.shape[0], *(1,) * (x.ndim - 2), -1)
+        return jnp.where(rotated, self.scaling.restore(x), x)
+
+
+def _largest_step(x, dx):
+    """Largest `a` with `x + a dx` in the second-order cone, for each contact."""
+    det = _det(x)
+    cross = x[:, 0] * dx[:, 0] - _dot(x[:, 1:], dx[:, 1:])
+    root = jnp.sqrt(jnp.maximum(cross**2 - _det(dx) * det, 0))
+    denominator = root - cross
+    return jnp.where(denominator > 0, det / jnp.where(denominator > 0, denominator, 1), jnp.inf)
+
+
+def _largest_step_line(x, dx):
+    return jnp.where(dx < 0, -x / jnp.where(dx < 0, dx, -1), jnp.inf)
+
+
+def _step_length(it: _Iterate, step: _Iterate):
+    lengths = [
+        _largest_step(it.y, step.y),
+        _largest_step(it.z, step.z),
+        _largest_step_line(it.u, step.u),
+        _largest_step_line(it.w, step.w),
+    ]
+    return jnp.min(jnp.stack([jnp.min(a, axis=0) for a in lengths]), axis=0)
+
+
+def _advance(it: _Iterate, step: _Iterate, length) -> _Iterate:
+    return _Iterate(*(a + length * b for a, b in zip(it, step, strict=True)))
+
+
+def _complementarity(it: _Iterate):
+    """Mean complementarity product of the cones and the bounds."""
+    k = it.u.shape[0]
+    return (jnp.sum(_dot(it.y, it.z), axis=0) + jnp.sum(it.u * it.w, axis=0)) / (2 * k)
+
+
+def _stationarity(problem: _Problem, it: _Iterate):
+    return _add_normal(_matvec(problem.Q, it.y) + problem.q - it.z, -it.w)
+
+
+def _merit(problem: _Problem, it: _Iterate, smoothing):
+    """Largest violation of the (perturbed) optimality conditions."""
+    residual = jnp.max(jnp.abs(_stationarity(problem, it)), axis=(0, 1))
+    return jnp.maximum(residual, _complementarity(it) - smoothing)
+
+
+def _interior_point_step(problem: _Problem, it: _Iterate, smoothing) -> _Iterate:
+    scaling = _Scaling.of(it.y, it.z)
+    matrix = _NewtonMatrix(problem, it, scaling)
+    curvature = it.w / it.u
+    gradient = _matvec(problem.Q, it.y) + problem.q
+
+    def newton(correction, bound_correction):
+        dy = matrix.solve(_add_normal(correction - gradient, bound_correction))
+        dz = correction - it.z - scaling.restore(scaling.inverse**2 * scaling.rotate(dy))
+        dw = bound_correction - it.w - curvature * dy[:, 0]
+        return _Iterate(dy, dy[:, 0], dz, dw)
+
+    mean = _complementarity(it)
+    affine = newton(jnp.zeros_like(it.y), jnp.zeros_like(it.u))
+    length = jnp.minimum(_step_length(it, affine), 1)
+    sigma = jnp.maximum(_complementarity(_advance(it, affine, length)) / mean, 0) ** 3
+    center = jnp.maximum(jnp.minimum(sigma, 1) * mean, smoothing)
+
+    def scale_inverse(x):  # W^-1 x
+        return scaling.restore(scaling.inverse * scaling.rotate(x))
+
+    def scale(x):  # W x
+        return scaling.restore(scaling.rotate(x) / scaling.inverse)
+
+    identity = jnp.zeros_like(it.y).at[:, 0].set(1)
+    product = _jordan_product(scale_inverse(affine.y), scale(affine.z))
+    correction = scale_inverse(_jordan_divide(scale(it.z), center * identity - product))
+    bound_correction = (center - affine.u * affine.w) / it.u
+    step = newton(correction, bound_correction)
+    fraction = 1 - jnp.clip(0.1 * mean, 1e-3, 0.01)
+    length = jnp.minimum(fraction * _step_length(it, step), 1)
+    return _advance(it, step, length)
+
+
+class _Loop(NamedTuple):
+    it: _Iterate
+    best: _Iterate
+    merit: Float[Array, " B"]  # of `best`
+    stalled: Int[Array, " B"]  # iterations since `merit` halved
+    done: Bool[Array, " B"]
+    iteration: Int[Array, ""]
+
+
+def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) -> _Loop:
+    """Iterate until every problem of the batch has met `target`, or stopped improving."""
+    smoothing = jnp.asarray(settings.smoothing, problem.q.dtype)
+    batch = problem.q.shape[-1]
+
+    def keep_going(loop: _Loop):
+        return jnp.any(~loop.done) & (loop.iteration < settings.max_iterations)
+
+    def body(loop: _Loop):
+        new = _interior_point_step(problem, loop.it, smoothing)
+        merit = _merit(problem, new, smoothing)
+        # An iterate that rounding has pushed out of the interior has a merit that is not finite (or products
+        # that are not positive); its problem stops at the best iterate seen.
+        inside = jnp.isfinite(merit) & (jnp.min(_det(new.y), axis=0) > 0) & (jnp.min(_det(new.z), axis=0) > 0)
+        move = inside & ~loop.done
+        better = move & (merit < loop.merit)
+        halved = merit < 0.5 * loop.merit
+        stalled = jnp.where(halved, 0, loop.stalled + 1)
+        # At the level of rounding nothing more is to be had; far from it, redundant contacts may take a while.
+        patience = jnp.where(loop.merit <= settings.tolerance * 1e-3, 3, 15)
+        merit = jnp.where(better, merit, loop.merit)
+        done = loop.done | ~inside | (merit <= settings.target) | (stalled >= patience)
+        it = jax.tree.map(lambda a, b: jnp.where(move, a, b), new, loop.it)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, loop.best)
+        return _Loop(it, best, merit, stalled, done, loop.iteration + 1)
+
+    merit = _merit(problem, start, smoothing)
+    loop = _Loop(start, start, merit, jnp.zeros(batch, int), jnp.zeros(batch, bool), jnp.asarray(0))
+    return jax.lax.while_loop(keep_going, body, loop)
+
+
+# --- From physical to scaled problems and back -----------------------------------------------------------------
+
+
+class _Scales(NamedTuple):
+    """What turns scaled quantities into physical ones; see `_scale`."""
+
+    S: Float[Array, "K d B"]  # y_scaled * S * unit = f
+    size: Float[Array, "K B"]  # 1 / sqrt(A_nn): y_scaled * size * unit = (f_n, g_t)
+    unit: Float[Array, " B"]
+    delta: Float[Array, " B"]
+    regularization: Float[Array, "K d B"]  # the diagonal that delta becomes in the scaled problem
+
+
+def _scale(A, v, friction, lower, delta) -> tuple[_Problem, _Scales]:
+    """Batch last: A (K, d, K, d, B), v (K, d, B), friction, lower (K, B)."""
+    k, d, batch = v.shape
+    dtype = v.dtype
+    index = jnp.arange(k)
+    normal = A[index, 0, index, 0]
+    # A contact without inverse inertia is padding. It becomes: minimise f_n^2 / 2 + f_n, with the solution 0.
+    present = normal > 0
+    mean = jnp.sum(jnp.where(present, normal, 0), axis=0) / jnp.maximum(jnp.sum(present, axis=0, dtype=dtype), 1)
+    delta = delta * mean
+    size = jnp.where(present, jax.lax.rsqrt(jnp.where(present, normal + delta, 1)), 0)
+    S = size[:, None] * jnp.concatenate(
+        [jnp.ones((k, 1, batch), dtype), jnp.broadcast_to(friction[:, None], (k, d - 1, batch))], axis=1
+    )
+    regularization = S**2 * delta
+    # Rows that vanish (padding, tangents of frictionless contacts) get an own diagonal to be definite.
+    floor = jnp.where(present[:, None], jnp.asarray(jnp.finfo(dtype).eps, dtype), 1)
+    Q = S[:, :, None, None] * A * S[None, None]
+    Q = Q.at[index[:, None], jnp.arange(d), index[:, None], jnp.arange(d)].add(regularization + floor)
+    q = S * v
+    lower = jnp.where(present, lower / jnp.where(present, size, 1), 0)
+    largest = jnp.maximum(jnp.max(jnp.abs(q), axis=(0, 1)), jnp.max(lower, axis=0))
+    unit = jnp.maximum(largest, jnp.finfo(dtype).tiny ** 0.5)
+    q = jnp.where(present[:, None], q / unit, jnp.zeros_like(q).at[:, 0].set(1))
+    problem = _Problem(Q.reshape(k * d, k * d, batch), q, lower / unit)
+    return problem, _Scales(S, size, unit, delta, regularization)
+
+
+# A bound at the cone's apex (lower = 0, as for restitution 0) is lifted by this fraction of the problem's scale, so
+# that there the derivative with respect to the bound is the one-sided one for a growing bound: 1, not a blend.
+_LIFT = 1e-10
+# Without a bound, the bound of the scaled problem is here, where the cone keeps the impulse away from it.
+_NO_BOUND = -1.0
+
+
+class _Internal(NamedTuple):
+    """A solution and what its derivative needs, batch first."""
+
+    impulse: Float[Array, "B K d"]
+    regular: Float[Array, "B K d"]  # (f_n, g_t) of the regularised problem, in physical units
+    inverse: Float[Array, "B n n"]  # (Q + W^-2 + D)^-1, in the units of (f_n, g_t)
+    bound: Float[Array, "B K"]  # D
+    diagonal: Float[Array, " B"]  # delta
+    residual: Float[Array, " B"]
+    iterations: Int[Array, " B"]
+
+
+def _solve_block(A, v, friction, lower, settings: ConeSettings, bounded: bool) -> _Internal:
+    """Solve one block of problems: batch first in and out, batch last inside."""
+    batch, k, d = v.shape
+    finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction + lower).all(1)
+    A_last = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
+    v_last = jnp.moveaxis(v, 0, -1)
+    problem, scales = _scale(A_last, v_last, friction.T, lower.T, settings.diagonal)
+    if bounded:
+        problem = problem._replace(lower=jnp.maximum(problem.lower, _LIFT))
+    else:
+        problem = problem._replace(lower=jnp.full_like(problem.lower, _NO_BOUND))
+    one = jnp.ones((k, batch), v.dtype)
+    identity = jnp.zeros_like(v_last).at[:, 0].set(1)
+    start = _Iterate(_add_normal(identity, jnp.maximum(problem.lower, 0)), one, identity, one)
+    start = start._replace(u=start.y[:, 0] - problem.lower)
+    loop = _interior_point(problem, start, settings)
+    it = loop.best
+
+    n = k * d
+    eye = jnp.broadcast_to(jnp.eye(n, dtype=v.dtype)[..., None], (n, n, batch)).reshape(k, d, n, batch)
+    inverse = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z)).solve(eye).reshape(n, n, batch)
+    # First-order correction for the diagonal: the impulse of the problem as it was given.
+    y = it.y + _matvec(inverse, scales.regularization * it.y)
+    nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
+    size = jnp.broadcast_to(scales.size[:, None], (k, d, batch))
+    both = size.reshape(n, 1, batch) * size.reshape(1, n, batch)
+    return _Internal(
+        impulse=jnp.moveaxis(scales.S * scales.unit * y + nan, -1, 0),
+        regular=jnp.moveaxis(size * scales.unit * it.y, -1, 0),
+        inverse=jnp.moveaxis(inverse * both, -1, 0),
+        bound=(it.w / it.u / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
+        diagonal=scales.delta,
+        residual=jnp.where(finite, loop.merit, jnp.inf),
+        iterations=jnp.broadcast_to(loop.iteration, (batch,)),
+    )
+
+
+# --- Batches ----------------------------------------------------------------------------------------------------
+
+BLOCK = 128
+"""Problems solved together: enough to fill vector units, few enough for their matrices to stay in cache."""
+
+
+def _solve_batch(A, v, friction, lower, settings: ConeSettings, bounded: bool) -> _Internal:
+    """Solve the problems that have a contact, block by block; the others cost nothing and give zeros."""
+    batch, k, d = v.shape
+    n = k * d
+    block = min(BLOCK, batch)
+    index = jnp.arange(k)
+    diagonal = A.reshape(batch, k, d, k, d)[:, index, 0, index, 0]
+    present = jnp.any(~(diagonal <= 0), axis=1)  # NaN counts as present, so that it is reported
+    order = jnp.nonzero(present, size=-(-batch // block) * block, fill_value=batch)[0]
+    zeros = _Internal(
+        impulse=jnp.zeros((batch, k, d), v.dtype),
+        regular=jnp.zeros((batch, k, d), v.dtype),
+        inverse=jnp.zeros((batch, n, n), v.dtype),
+        bound=jnp.zeros((batch, k), v.dtype),
+        diagonal=jnp.zeros(batch, v.dtype),
+        residual=jnp.zeros(batch, v.dtype),
+        iterations=jnp.zeros(batch, int),
+    )
+
+    def body(i, out):
+        rows = jax.lax.dynamic_slice(order, (i * block,), (block,))
+        data = (x.at[rows].get(mode="fill", fill_value=0) for x in (A, v, friction, lower))
+        solved = _solve_block(*data, settings, bounded)
+        return jax.tree.map(lambda o, s: o.at[rows].set(s, mode="drop"), out, solved)
+
+    blocks = (jnp.sum(present) + block - 1) // block
+    return jax.lax.fori_loop(0, blocks, body, zeros)
+
+
+@functools.cache
+def _batched(settings: ConeSettings, bounded: bool):
+    """`_solve_batch` for these settings, whose batching under vmap is one larger batch."""
+
+    @jax.custom_batching.custom_vmap
+    def solve(A, v, friction, lower):
+        return _solve_batch(A, v, friction, lower, settings, bounded)
+
+    @solve.def_vmap
+    def _(size, batched, *arrays):
+        flat = []
+        for x, is_batched in zip(arrays, batched, strict=True):
+            x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+            flat.append(x.reshape(-1, *x.shape[2:]))
+        out = solve(*flat)
+        out = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    @jax.custom_jvp
+    def undifferentiated(*arrays):
+        return solve(*arrays)
+
+    @undifferentiated.defjvp
+    def _(primals, tangents):
+        raise NotImplementedError(
+            "carom's cone solver has first derivatives only: its derivative cannot be differentiated again. "
+            "Use a Gauss-Newton approximation, or differences of gradients, in place of second derivatives."
+        )
+
+    return undifferentiated
+
+
+def _friction_scale(x, friction):
+    """`S x`: the tangential components times mu."""
+    return jnp.concatenate([x[..., :1], x[..., 1:] * friction[..., None]], axis=-1)
+
+
+def _apply(A, x):
+    """`A x` for `x` as (B, K, d)."""
+    return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
+def _impulse(A, v, friction, lower, settings: ConeSettings, bounded: bool):
+    out = _batched(settings, bounded)(A, v, friction, lower)
+    return out.impulse, out.residual, out.iterations
+
+
+# The derivative. At the solution (or at the point of the central path where `smoothing` ends) the conditions
+#
+#     S (A S y + delta S y + v) = z + D (y_n - lower) e_n ...,   y = (f_n, g_t),  f = S y
+#
+# with z and w eliminated by their linearised complementarity (dz = -W^-2 dy, dw = -D (dy_n - dlower)) give
+#
+#     (Q + W^-2 + D) dy = -( dS (A f + delta f + v) + S (dA f + dv + (A + delta) dS y) ) + D e_n dlower
+#
+# (optimality conditions as in Amos and Kolter, OptNet, 2017, eq. 6, for the cones used here). Everything on the right
+# is linear in the tangents and the matrix is the solver's own, so that both modes, vmap and jit follow from this rule.
+@_impulse.defjvp
+def _impulse_jvp(settings, bounded, primals, tangents):
+    A, v, friction, lower = primals
+    dA, dv, dfriction, dlower = tangents
+    out = _batched(settings, bounded)(A, v, friction, lower)
+    f = _friction_scale(out.regular, friction)
+    after = _apply(A, f) + out.diagonal[:, None, None] * f + v
+    # Where mu = 0 the tangent g is not determined by the problem. For a growing mu, friction opposes sliding.
+    tangent = after[..., 1:]
+    norm = jnp.sqrt(jnp.sum(tangent**2, axis=-1, keepdims=True))
+    sliding = -out.regular[..., :1] * tangent / jnp.where(norm > 0, norm, 1)
+    g = jnp.where(friction[..., None] == 0, sliding, out.regular[..., 1:])
+    dSy = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * g], axis=-1)
+    dS_after = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * tangent], axis=-1)
+    force = _apply(dA, f) + dv + _apply(A, dSy) + out.diagonal[:, None, None] * dSy
+    rhs = -(dS_after + _friction_scale(force, friction))
+    if bounded:
+        rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None], rhs[..., 1:]], axis=-1)
+    df = dSy + _friction_scale(_apply(out.inverse, rhs), friction)
+    primal = (out.impulse, out.residual, out.iterations)
+    return primal, (df, jnp.zeros_like(out.residual), np.zeros(out.iterations.shape, jax.dtypes.float0))
+
+
+class ConeSolution(NamedTuple):
+    """Solutions of a batch of problems.
+
+    `residual` is the largest violation of the optimality conditions, relative to the problem's scale (infinite where
+    the data were not finite, which makes the impulse NaN); `iterations` is that of the block a problem was solved in.
+    """
+
+    impulse: Float[Array, "B K d"]
+    residual: Float[Array, " B"]
+    iterations: Int[Array, " B"]
+
+
+def solve_cone_problem(
+    A: Float[Array, "B n n"],
+    v: Float[Array, "B K d"],
+    friction: Float[Array, "B K"],
+    lower: Float[Array, "B K"] | None = None,
+    *,
+    smoothing: float = 0.0,
+) -> ConeSolution:
+    """Minimise `1/2 f^T A f + f^T v` over friction cones, for a batch of problems.
+
+    **Arguments:** `A` (B, K d, K d), symmetric positive semi-definite, velocity per impulse (1 / kg); `v` (B, K, d),
+    velocities of the contact points, normal first (m/s); `friction` (B, K), Coulomb's mu >= 0; `lower` (B, K),
+    least normal impulses (N s), >= 0, or `None` for zero; `smoothing`, final value of the complementarity products
+    relative to the problem's scale.
+
+    A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is the
+    one of least norm. The iterations run in double precision where that is enabled, whatever the dtype of the
+    data. Differentiable once, in forward and reverse mode.
+
+    **Source:** paper, eqs. 5 and 7, appendix C; method: Vandenberghe, *The CVXOPT linear and quadratic cone program
+    solvers*, 2010.
+    """
+    dtype = v.dtype
+    settings = ConeSettings.for_dtype(dtype, smoothing)
+    work = jnp.promote_types(dtype, jnp.zeros((), float).dtype)
+    bounded = lower is not None
+    low = jnp.zeros_like(friction) if lower is None else lower
+    f, residual, iterations = _impulse(*(x.astype(work) for x in (A, v, friction, low)), settings, bounded)
+    return ConeSolution(f.astype(dtype), residual.astype(dtype), iterations)

@@ -1,0 +1,123 @@
+r"""Smooth constrained dynamics in Cartesian coordinates (paper, appendix B): Lagrangian and Hamiltonian fields.
+
+Notation: `G = J_E M^-1 J_E^T`, with `J_E = D_x Phi` from automatic differentiation.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float
+
+Formulation = Literal["lagrangian", "hamiltonian"]
+
+
+class SaddlePoint(eqx.Module):
+    """The constraints at one state, with `G` factored once: every use of the multipliers goes through here.
+
+    Solutions of `[M, J^T; J, 0]` reduce to `G`: symmetric positive definite where the constraints are independent.
+    """
+
+    jacobian: Float[Array, "E n d"]
+    inverse_mass: Float[Array, "n n"]
+    operator: lx.MatrixLinearOperator
+    state: object
+
+    def __init__(self, jacobian: Float[Array, "E n d"], inverse_mass: Float[Array, "n n"]):
+        self.jacobian, self.inverse_mass = jacobian, inverse_mass
+        G = self.to_rows(self.from_impulses(jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)))
+        self.operator = lx.MatrixLinearOperator((G + G.T) / 2, lx.positive_semidefinite_tag)
+        self.state = lx.Cholesky().init(self.operator, {})
+
+    def solve(self, rhs: Float[Array, " E"]) -> Float[Array, " E"]:
+        """`G^-1 rhs`."""
+        return lx.linear_solve(self.operator, rhs, lx.Cholesky(), state=self.state, throw=False).value
+
+    def to_rows(self, velocity: Float[Array, "k n d"]) -> Float[Array, "E k"]:
+        """`J_E v` for several velocities."""
+        return jnp.einsum("eid,kid->ek", self.jacobian, velocity)
+
+    def from_impulses(self, impulse: Float[Array, "k E"]) -> Float[Array, "k n d"]:
+        """`M^-1 J_E^T f` for several sets of constraint impulses."""
+        return jnp.einsum("ij,ejd,ke->kid", self.inverse_mass, self.jacobian, impulse)
+
+    def project(self, velocity: Float[Array, "k n d"]) -> Float[Array, "k n d"]:
+        """The nearest velocities, in the metric of the mass, that obey the constraints (S.12 for `M^-1 p`)."""
+        multipliers = jax.vmap(self.solve)(self.to_rows(velocity).T)
+        return velocity - self.from_impulses(multipliers)
+
+
+def saddle_point(
+    constraints: Callable, x: Float[Array, "n d"], inverse_mass: Float[Array, "n n"]
+) -> SaddlePoint:
+    """The saddle-point problem of the constraints at `x`."""
+    return SaddlePoint(jax.jacrev(constraints)(x), inverse_mass)
+
+
+def has_equations(constraints: Callable, x: Float[Array, "n d"]) -> bool:
+    """Whether there is any constraint at all."""
+    return jax.eval_shape(constraints, x).shape[0] > 0
+
+
+def lagrangian_field(
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    *,
+    force: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    constraints: Callable,
+) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+    """Time derivatives of `x` and `v` under S.2, with `force = -grad V + u` (N).
+
+    `v' = M^-1 (F - J^T lambda)`, `G lambda = J M^-1 F + (D_x (J v)) v`.
+    """
+    free = inverse_mass @ force
+    if not has_equations(constraints, x):
+        return v, free
+    saddle = saddle_point(constraints, x, inverse_mass)
+
+    def rate(x):  # J(x) v
+        return jax.jvp(constraints, (x,), (v,))[1]
+
+    _, curvature = jax.jvp(rate, (x,), (v,))
+    multipliers = saddle.solve(saddle.to_rows(free[None])[:, 0] + curvature)
+    return v, free - saddle.from_impulses(multipliers[None])[0]
+
+
+def hamiltonian_field(
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    *,
+    force: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    constraints: Callable,
+) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+    """Time derivatives of `x` and `v` under S.4 and S.7, with `force = -grad V + u` (N).
+
+    The two constraints `Psi = (Phi, Phi')` give a matrix `[0, G; -G, S]`, so that S.4 needs `G` alone:
+    `G beta = J v`, `G alpha = S beta - B v - J M^-1 F`, `x' = v - M^-1 J^T beta`,
+    `v' = M^-1 (F + J^T alpha + B^T beta)`, with `B = D_x (J v)` and `S = B M^-1 J^T - J M^-1 B^T`. Where the constraints hold,
+    `beta = 0` and this is the Lagrangian field.
+    """
+    free = inverse_mass @ force
+    if not has_equations(constraints, x):
+        return v, free
+    saddle = saddle_point(constraints, x, inverse_mass)
+
+    def rate(x):  # J(x) v, so that B = D_x rate
+        return jax.jvp(constraints, (x,), (v,))[1]
+
+    jv, B_transposed = jax.vjp(rate, x)
+    beta = saddle.solve(jv)
+    drift = saddle.from_impulses(beta[None])[0]
+    (B_beta,) = B_transposed(beta)
+    _, B_velocity = jax.jvp(rate, (x,), (v - drift,))  # B v - B M^-1 J^T beta
+    push = free + inverse_mass @ B_beta
+    alpha = saddle.solve(-B_velocity - saddle.to_rows(push[None])[:, 0])
+    return v - drift, push + saddle.from_impulses(alpha[None])[0]
+
+
+FIELDS: dict[Formulation, Callable] = {"lagrangian": lagrangian_field, "hamiltonian": hamiltonian_field}

@@ -1,0 +1,285 @@
+"""One time step, and many: `step`, `simulate` and the `Trajectory` they give."""
+
+from typing import Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from carom.checks import as_floats, is_known, require, require_values
+from carom.contact.impulses import target_velocity, two_phases
+from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
+from carom.simulation.integrators import RK4, flow
+from carom.simulation.projection import project_state
+from carom.system import System
+
+ImpactRule = Literal["step"]
+
+COMPENSATION_STEPS = 8
+"""Time steps over which a penetration is undone, by default (paper, appendix G)."""
+
+
+class Trajectory(eqx.Module):
+    """Motion of a system; a batch of them has leading axes.
+
+    `x`, `v` (..., time, n, d) in m and m/s; `contact` (..., time): the step that ends here had a closed contact; `time`
+    (time,) in s; `overflow` (..., time): closed contacts that found no place in the solver; `residual` (..., time): the
+    solver's relative residual. `simulate` raises where the last two say that a result is not right, unless it is traced.
+    """
+
+    x: Float[Array, "*b time n d"]
+    v: Float[Array, "*b time n d"]
+    contact: Bool[Array, "*b time"]
+    time: Float[Array, " time"]
+    overflow: Int[Array, "*b time"]
+    residual: Float[Array, "*b time"]
+
+
+class Stepper(eqx.Module):
+    """How to step: everything but the system and its state."""
+
+    dt: Float[Array, ""]
+    formulation: Formulation = eqx.field(static=True, default="lagrangian")
+    solver: diffrax.AbstractSolver = eqx.field(default_factory=RK4)
+    project: bool = eqx.field(static=True, default=True)
+    compensation_steps: float | None = eqx.field(static=True, default=COMPENSATION_STEPS)
+    smoothing: float = eqx.field(static=True, default=0.0)
+    contact: bool = eqx.field(static=True, default=True)
+
+
+class StepResult(eqx.Module):
+    """State after a step, whether a contact was closed, and how the contact solver fared."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    contact: Bool[Array, ""]
+    overflow: Int[Array, ""]
+    residual: Float[Array, ""]
+
+
+def step(
+    system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None
+) -> StepResult:
+    """Integrate one whole step, then let the contacts act that are closed at its end (the paper's rule)."""
+    inverse_mass = system.inverse_mass_matrix()
+    field = FIELDS[stepper.formulation]
+
+    def rate(state):
+        x, v = state
+        total = -jax.grad(system.potential_energy)(x)
+        if force is not None:
+            total = total + force
+        return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
+
+    x, v = flow(stepper.solver, rate, (x, v), stepper.dt)
+    if stepper.project:
+        x, v = project_state(system.constraints, x, v, inverse_mass)
+    if not stepper.contact or not system.contacts:
+        return StepResult(x, v, jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
+    return impact(system, x, v, inverse_mass, stepper)
+
+
+def impact(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+) -> StepResult:
+    """Let the contacts that are closed at `x` change the velocity (S.8 to S.15)."""
+    active = system.active(x)
+    k, d = active.jacobian.shape[:2]
+    rows = active.jacobian.reshape(k * d, system.n_points, d)
+    response = jnp.einsum("ij,rjd->rid", inverse_mass, rows)  # M^-1 J_C^T
+    saddle = SaddlePoint(jax.jacrev(system.constraints)(x), inverse_mass) if system.links else None
+    if saddle is not None:
+        response = saddle.project(response)
+    delassus = jnp.einsum("rid,sid->rs", rows, response)
+    delassus = (delassus + delassus.T) / 2
+    velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
+    v_star = jnp.zeros_like(velocity)
+    if stepper.compensation_steps is not None:
+        joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
+        depth = jnp.where(active.active, -active.gap, 0)
+        v_star = target_velocity(
+            active.jacobian, depth, joints, time=stepper.dt * stepper.compensation_steps
+        )
+    compression, rebound = two_phases(
+        delassus,
+        velocity,
+        system.friction[active.property_index],
+        system.restitution[active.property_index],
+        v_star,
+        smoothing=stepper.smoothing,
+    )
+    impulse = (compression.impulse + rebound.impulse).reshape(-1)
+    return StepResult(
+        x=x,
+        v=v + jnp.einsum("rid,r->id", response, impulse),
+        contact=jnp.any(active.active),
+        overflow=active.overflow,
+        residual=jnp.maximum(compression.residual, rebound.residual),
+    )
+
+
+def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) -> Trajectory:
+    """`steps` steps from one state (n, d): the pure function under `simulate`."""
+
+    def body(state, force):
+        result = step(system, *state, stepper, force)
+        return (result.x, result.v), result
+
+    _, out = jax.lax.scan(body, (x0, v0), force, length=steps)
+
+    def start(first, rest):
+        return jnp.concatenate([jnp.asarray(first, rest.dtype)[None], rest])
+
+    return Trajectory(
+        x=start(x0, out.x),
+        v=start(v0, out.v),
+        contact=start(False, out.contact),
+        time=stepper.dt * jnp.arange(steps + 1, dtype=x0.dtype),
+        overflow=start(0, out.overflow),
+        residual=start(0, out.residual),
+    )
+
+
+@eqx.filter_jit
+def _simulate(system, x0, v0, stepper, steps, force):
+    if x0.ndim == 2:
+        return rollout(system, x0, v0, stepper, steps, force)
+    out = jax.vmap(lambda x, v, f: rollout(system, x, v, stepper, steps, f), (0, 0, None if force is None else 0))(
+        x0, v0, force
+    )
+    return eqx.tree_at(lambda t: t.time, out, out.time[0])
+
+
+def simulate(
+    system: System,
+    x0: Float[Array, "*b n d"],
+    v0: Float[Array, "*b n d"],
+    *,
+    dt: float,
+    steps: int,
+    impact: ImpactRule = "step",
+    project: bool = True,
+    force: Float[Array, "*b steps n d"] | None = None,
+    formulation: Formulation = "lagrangian",
+    solver: diffrax.AbstractSolver | None = None,
+    compensation_steps: float | None = COMPENSATION_STEPS,
+    smoothing: float = 0.0,
+    throw: bool = True,
+) -> Trajectory:
+    """Motion of `system` from `x0`, `v0`: pure, jit-able, vmap-able, differentiable in both modes.
+
+    **Arguments:**
+
+    - `x0`, `v0`: (n, d) or (N, n, d), positions (m) and velocities (m/s) of the points.
+    - `dt`, `steps`: time step (s) and number of steps.
+    - `impact`: `"step"` integrates a whole step and lets the contacts act that are closed at its end.
+    - `project`: bring each step's end back onto the constraints.
+    - `force`: (steps, n, d) or (N, steps, n, d) in N, held over each step, added to the generalised force.
+    - `formulation`: `"lagrangian"` or `"hamiltonian"`; the same motion.
+    - `solver`: any explicit diffrax solver; by default `RK4`.
+    - `compensation_steps`: time steps over which penetration is undone, or `None` to leave it.
+    - `smoothing`: see `solve_impulse`.
+    - `throw`: raise on a result that is not right, where it can be seen (outside of jit). If false, or traced, look at
+      `Trajectory.overflow` and `Trajectory.residual`.
+
+    **Raises:** `CaromError` for shapes that do not fit, NaN, a start inside a wall or off the constraints, more closed
+    contacts than `max_active`, an unsolved contact, motion that is not finite.
+    """
+    x0, v0 = as_floats(x0), as_floats(v0)
+    require(impact == "step", f'impact must be "step"; it was {impact!r}.')
+    require(formulation in FIELDS, f"formulation must be one of {sorted(FIELDS)}; it was {formulation!r}.")
+    require(isinstance(steps, int | np.integer) and steps > 0, f"steps must be a positive whole number; it was {steps}.")
+    require_values("dt", dt, np.asarray(dt) > 0 if is_known(dt) else True, "a positive number of seconds")
+    require(
+        compensation_steps is None or compensation_steps > 0,
+        f"compensation_steps must be positive, or None for none; it was {compensation_steps}.",
+    )
+    check_initial_state(system, x0, v0)
+    if force is not None:
+        force = as_floats(force)
+        wanted = (*x0.shape[:-2], steps, *x0.shape[-2:])
+        if force.shape == wanted[-3:]:
+            force = jnp.broadcast_to(force, wanted)
+        require(force.shape == wanted, f"force must have the shape {wanted}; it was {force.shape}.")
+    stepper = Stepper(
+        dt=jnp.asarray(dt, x0.dtype),
+        formulation=formulation,
+        solver=RK4() if solver is None else solver,
+        project=project,
+        compensation_steps=compensation_steps,
+        smoothing=smoothing,
+    )
+    out = _simulate(system, x0, v0, stepper, int(steps), force)
+    if throw:
+        check_trajectory(system, out)
+    return out
+
+
+def check_initial_state(system: System, x0, v0) -> None:
+    """Raise `CaromError` for initial states that cannot be: shapes, NaN, inside walls, off the constraints."""
+    shape = (system.n_points, system.dim)
+    require(
+        x0.shape[-2:] == shape and x0.ndim in (2, 3),
+        f"x0 must have the shape {shape} or (N, {shape[0]}, {shape[1]}) for this system; it was {x0.shape}.",
+    )
+    require(x0.shape == v0.shape, f"v0 must have the shape of x0, {x0.shape}; it was {v0.shape}.")
+    if not is_known(x0, v0, system):
+        return
+    for name, value in (("x0", x0), ("v0", v0)):
+        require(bool(np.isfinite(value).all()), f"{name} must be finite; it had NaN or infinite values.")
+    x = x0.reshape(-1, *shape)
+    gaps = np.asarray(system.gaps(x))
+    through = gaps < -np.asarray(system.reach()) - 1e-9
+    if through.any():
+        state, candidate = np.argwhere(through)[0]
+        bodies = [b for contact in system.contacts for b in contact.bodies_of()][candidate]
+        raise_through(state, bodies, -gaps[state, candidate])
+    drift = np.abs(np.asarray(system.constraints(x)))
+    if drift.size and drift.max() > 2e-2:
+        state, row = np.unravel_index(drift.argmax(), drift.shape)
+        require(
+            False,
+            f"x0 does not obey the constraints: equation {row} of state {state} is off by {drift.max():.2g} m^2. "
+            "Start from positions that fit the rods and joints (carom.sample gives such).",
+        )
+
+
+def raise_through(state: int, bodies: tuple[int, ...], depth: float) -> None:
+    """Say which bodies start inside each other or a wall."""
+    where = f"body {bodies[0]} is inside a wall" if len(bodies) == 1 else f"bodies {bodies[0]} and {bodies[1]} overlap"
+    require(False, f"x0 starts in an impossible place: in state {state}, {where} ({depth:.3g} m deep). Move it out.")
+
+
+def check_trajectory(system: System, trajectory: Trajectory) -> None:
+    """Raise `CaromError` where a simulation went wrong, if its values are known."""
+    if not is_known(trajectory):
+        return
+    over = np.asarray(trajectory.overflow)
+    require(
+        not over.any(),
+        f"more contacts closed at once than the solver has places for: max_active is {system.max_active}, "
+        f"{system.max_active + over.max()} were needed. Build the System with a larger max_active.",
+    )
+    finite = np.isfinite(np.asarray(trajectory.x)).all((-1, -2)) & np.isfinite(np.asarray(trajectory.v)).all((-1, -2))
+    if not finite.all():
+        index = np.argwhere(~finite)[0]
+        require(
+            False,
+            f"the motion is not finite from step {index[-1]} on"
+            + (f" in trajectory {index[0]}" if len(index) > 1 else "")
+            + ". Use a smaller dt, or look at the potential.",
+        )
+    worst = float(np.max(trajectory.residual))
+    allowed = 1e-6 if trajectory.x.dtype == jnp.float64 else 1e-2
+    require(
+        worst <= allowed,
+        f"a contact was not solved: relative residual {worst:.1e}, allowed {allowed:.0e}. Bodies may be wedged between "
+        "walls; use a smaller dt, or start elsewhere.",
+    )

@@ -1,0 +1,233 @@
+"""The System: bodies, constraints, contacts, potential and contact properties in one pytree."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from carom.checks import as_floats, is_known, require, require_values
+from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
+from carom.mechanics.bodies import (
+    Body,
+    BodyTable,
+    RigidBody,
+    total_inverse_mass_matrix,
+    total_mass_matrix,
+)
+from carom.mechanics.constraints import Constraint, Rigid
+from carom.mechanics.potentials import NoPotential, Potential
+
+
+class System(eqx.Module):
+    """A mechanical system with contact. True and learned systems are the same type.
+
+    **Arguments:**
+
+    - `bodies`: `PointMass` and `RigidBody` objects; their points are stacked in this order into `x` (n, d).
+    - `constraints`: `Distance`, `Tether`, `Joint` objects between points; a rigid body's own are added.
+    - `contacts`: `DiskDisk`, `DiskPlane` objects.
+    - `potential`: a `Potential`, such as `Gravity((0., -9.81))`; none by default.
+    - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers to
+      them by its `property` index; a single number is shared by all.
+    - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
+      candidates, or twice as many as points where that is less: more are an error, never dropped.
+    - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
+    - `name`: the task's name, for a task's system.
+
+    **Raises:** `CaromError` for negative masses, mu < 0, e outside [0, 1], indices out of range, mixed dimensions.
+
+    SI units throughout.
+    """
+
+    bodies: tuple[Body, ...]
+    links: tuple[Constraint, ...]
+    contacts: tuple[Contact, ...]
+    potential: Potential
+    friction: Float[Array, " P"]
+    restitution: Float[Array, " P"]
+    dim: int = eqx.field(static=True)
+    max_active: int = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        constraints: Sequence[Constraint] = (),
+        contacts: Sequence[Contact] = (),
+        potential: Potential | None = None,
+        friction=0.0,
+        restitution=0.0,
+        *,
+        max_active: int | None = None,
+        dim: int | None = None,
+        name: str = "",
+    ):
+        require(len(bodies) > 0, "bodies must hold at least one body; it was empty.")
+        self.bodies, self.contacts, self.name = tuple(bodies), tuple(contacts), name
+        self.potential = NoPotential() if potential is None else potential
+        self.dim = _dimension(self.bodies, self.contacts, self.potential, dim)
+        table = self.table
+        rigid = [
+            Rigid(first, self.dim)
+            for first, body in zip(table.center, self.bodies, strict=True)
+            if isinstance(body, RigidBody)
+        ]
+        self.links = (*constraints, *rigid)
+        for link in self.links:
+            require(
+                all(0 <= p < table.n_points for p in link.points()),
+                f"{type(link).__name__} refers to the points {link.points()}, but the system has {table.n_points} "
+                f"(0 to {table.n_points - 1}).",
+            )
+        for contact in self.contacts:
+            used = [b for bodies in contact.bodies_of() for b in bodies]
+            require(
+                all(0 <= b < len(self.bodies) for b in used),
+                f"{type(contact).__name__} refers to the bodies {sorted(set(used))}, but the system has "
+                f"{len(self.bodies)} (0 to {len(self.bodies) - 1}).",
+            )
+        self.friction, self.restitution = _properties(friction, restitution, self._property_index())
+        count = self.n_candidates
+        default = count if count <= 4 else min(count, 2 * table.n_points)
+        self.max_active = default if max_active is None else min(int(max_active), count)
+        require(
+            count == 0 or self.max_active > 0,
+            f"max_active must be at least 1 in a system with contacts; it was {max_active}.",
+        )
+
+    # --- structure -------------------------------------------------------------------------------------------
+
+    @property
+    def table(self) -> BodyTable:
+        """Which points belong to which body."""
+        return BodyTable.of(self.bodies, self.dim)
+
+    @property
+    def n_points(self) -> int:
+        """Number of points n."""
+        return self.table.n_points
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of contacts that could be closed."""
+        return len(self._property_index())
+
+    @property
+    def n_properties(self) -> int:
+        """Number of contact properties P."""
+        return self.friction.shape[0]
+
+    @property
+    def masses(self) -> Float[Array, " bodies"]:
+        """Masses of the bodies (kg)."""
+        return jnp.stack([body.mass for body in self.bodies])
+
+    @property
+    def radii(self) -> Float[Array, " bodies"]:
+        """Radii of the bodies (m)."""
+        return jnp.stack([body.radius for body in self.bodies])
+
+    def _property_index(self) -> np.ndarray:
+        return np.array([p for contact in self.contacts for p in contact.property_index], dtype=int)
+
+    # --- mechanics --------------------------------------------------------------------------------------------
+
+    def mass_matrix(self) -> Float[Array, "n n"]:
+        """Mass matrix (kg) over points; it acts on each axis alike."""
+        return total_mass_matrix(self.bodies, self.dim)
+
+    def inverse_mass_matrix(self) -> Float[Array, "n n"]:
+        """Its inverse (1/kg), in closed form."""
+        return total_inverse_mass_matrix(self.bodies, self.dim)
+
+    def kinetic_energy(self, v: Float[Array, "n d"]) -> Float[Array, ""]:
+        """`1/2 v^T M v` (J)."""
+        return jnp.sum(v * (self.mass_matrix() @ v)) / 2
+
+    def potential_energy(self, x: Float[Array, "n d"]) -> Float[Array, ""]:
+        """`V(x)` (J)."""
+        return self.potential(x, self.mass_matrix())
+
+    def energy(self, x: Float[Array, "*t n d"], v: Float[Array, "*t n d"]) -> Float[Array, "*t"]:
+        """Total energy (J) of a state, or of states along leading axes."""
+        if x.ndim > 2:
+            return jax.vmap(self.energy)(x, v)
+        return self.kinetic_energy(v) + self.potential_energy(x)
+
+    def constraints(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t E"]:
+        """`Phi(x)` of all links and rigid bodies, zero where they hold (m^2)."""
+        if x.ndim > 2:
+            return jax.vmap(self.constraints)(x)
+        if not self.links:
+            return jnp.zeros(0, x.dtype)
+        return jnp.concatenate([link(x) for link in self.links])
+
+    # --- contact ----------------------------------------------------------------------------------------------
+
+    def candidates(self, x: Float[Array, "n d"]) -> Candidates:
+        """Gaps (m) and Jacobians of all contacts that could be."""
+        return all_candidates(self.contacts, x, self.radii, self.table)
+
+    def active(self, x: Float[Array, "n d"]) -> Active:
+        """The closed contacts at `x`, deepest first, padded to `max_active`."""
+        return active_set(self.candidates(x), self._property_index(), self.max_active)
+
+    def gaps(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t C"]:
+        """Gap (m) of every candidate; negative where closed."""
+        if x.ndim > 2:
+            return jax.vmap(self.gaps)(x)
+        if not self.contacts:
+            return jnp.zeros(0, x.dtype)
+        return self.candidates(x).gap
+
+    def reach(self) -> Float[Array, " C"]:
+        """Depth (m) beyond which a contact is not closed but passed through."""
+        if not self.contacts:
+            return jnp.zeros(0)
+        return jnp.concatenate([contact.reach(self.radii) for contact in self.contacts])
+
+
+def _dimension(bodies, contacts, potential, dim) -> int:
+    """The one dimension that all parts agree on."""
+    said = {} if dim is None else {"dim": dim}
+    if potential.dimension() is not None:
+        said["potential"] = potential.dimension()
+    for contact in contacts:
+        if hasattr(contact, "normal"):
+            said[type(contact).__name__] = contact.normal.shape[0]
+    for body in bodies:
+        if isinstance(body, RigidBody):
+            said["RigidBody"] = body.moments.shape[0]
+    require(
+        len(set(said.values())) <= 1,
+        f"all parts of a system must have the same dimension; they had {said}. Check the vectors that were given.",
+    )
+    found = next(iter(said.values()), 2)
+    require(found in (2, 3), f"dim must be 2 or 3; it was {found}.")
+    return found
+
+
+def _properties(friction, restitution, index):
+    friction, restitution = jnp.atleast_1d(as_floats(friction)), jnp.atleast_1d(as_floats(restitution))
+    count = max(friction.shape[0], restitution.shape[0])
+    if friction.shape[0] == 1:
+        friction = jnp.broadcast_to(friction, (count,))
+    if restitution.shape[0] == 1:
+        restitution = jnp.broadcast_to(restitution, (count,))
+    require(
+        friction.shape == restitution.shape and friction.ndim == 1,
+        f"friction and restitution must have one value for each property; they had {friction.shape[0]} and "
+        f"{restitution.shape[0]}.",
+    )
+    require_values("friction", friction, friction >= 0, "at least 0 (Coulomb's mu)")
+    require_values("restitution", restitution, (restitution >= 0) & (restitution <= 1), "between 0 and 1")
+    if is_known(friction):
+        require(
+            index.size == 0 or (index.min() >= 0 and index.max() < count),
+            f"a contact's property index must be below the number of friction values ({count}); one was "
+            f"{index.max() if index.size else 0}. Give one friction and restitution for each property.",
+        )
+    return friction, restitution

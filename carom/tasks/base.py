@@ -1,0 +1,55 @@
+"""What a task is: a named system with its initial-state distribution and its time step."""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from carom.checks import require
+from carom.system import System
+
+
+class Task(eqx.Module):
+    """A named system of the benchmark. `dt` in s; `steps` of a training trajectory."""
+
+    name: eqx.AbstractVar[str]
+    dt: eqx.AbstractVar[float]
+    steps: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def system(self) -> System:
+        """The system, with its true parameters."""
+
+    @abc.abstractmethod
+    def sample(
+        self, system: System, key: PRNGKeyArray, n: int
+    ) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
+        """`n` initial states: positions (m) and velocities (m/s)."""
+
+
+def sample_free(
+    system: System, key: PRNGKeyArray, n: int, draw: Callable, *, most_rounds: int = 1000
+) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
+    """`n` states from `draw(key, count)`, leaving out those in which a contact is closed (rejection)."""
+    size = max(4 * n, 1024)
+    closed = eqx.filter_jit(lambda x: jnp.any(system.gaps(x) < 0, axis=-1))
+    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    count = 0
+    for round_key in jax.random.split(key, most_rounds):
+        x, v = draw(round_key, size)
+        free: Bool[np.ndarray, " size"] = ~np.asarray(closed(x))
+        kept.append((np.asarray(x)[free], np.asarray(v)[free]))
+        count += int(free.sum())
+        if count >= n:
+            break
+    require(
+        count >= n,
+        f"only {count} of {n} initial states without contact were found in {most_rounds} rounds of {size}: the bodies of this "
+        "system hardly fit. Make them smaller or fewer.",
+    )
+    x, v = (np.concatenate(parts)[:n] for parts in zip(*kept, strict=True))
+    return jnp.asarray(x), jnp.asarray(v)

@@ -1,0 +1,67 @@
+"""Chained pendulums above a ground (paper, appendix H): `cp3` and `cp3-e`."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from carom.contact.candidates import DiskPlane
+from carom.mechanics.bodies import PointMass
+from carom.mechanics.constraints import Distance, Tether
+from carom.mechanics.potentials import Gravity
+from carom.system import System
+from carom.tasks.base import Task, sample_free
+
+GRAVITY = 9.81
+
+
+def chain_state(
+    angles: Float[Array, "*b n"], rates: Float[Array, "*b n"], lengths: Float[Array, " n"]
+) -> tuple[Float[Array, "*b n 2"], Float[Array, "*b n 2"]]:
+    """Points and velocities of a chain hung from the origin.
+
+    `angles` (rad) and `rates` (rad/s) are those of each link from the downward vertical.
+    """
+    links = lengths[..., None] * jnp.stack([jnp.sin(angles), -jnp.cos(angles)], axis=-1)
+    spins = (lengths * rates)[..., None] * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+    return jnp.cumsum(links, axis=-2), jnp.cumsum(spins, axis=-2)
+
+
+class ChainedPendulum(Task):
+    """Point masses on massless rods, hung from the origin; the ground is at y = -1."""
+
+    name: str
+    masses: tuple[float, ...]
+    radii: tuple[float, ...]
+    friction: float
+    restitution: float
+    lengths: tuple[float, ...] = (0.35, 0.4, 0.35)
+    dt: float = 0.01
+    steps: int = 100
+
+    def system(self):
+        n = len(self.masses)
+        rods = [Distance(k - 1, k, self.lengths[k]) for k in range(1, n)]
+        return System(
+            bodies=[PointMass(m, r) for m, r in zip(self.masses, self.radii, strict=True)],
+            constraints=[Tether(0, (0.0, 0.0), self.lengths[0]), *rods],
+            contacts=[DiskPlane(range(n), point=(0.0, -1.0), normal=(0.0, 1.0))],
+            potential=Gravity((0.0, -GRAVITY)),
+            friction=self.friction,
+            restitution=self.restitution,
+            name=self.name,
+        )
+
+    def sample(self, system, key, n):
+        lengths = jnp.asarray(self.lengths, system.friction.dtype)
+
+        def draw(key, size):
+            key_angle, key_rate = jax.random.split(key)
+            shape = (size, len(self.lengths))
+            angles = jax.random.uniform(key_angle, shape, lengths.dtype, maxval=jnp.pi)
+            return chain_state(angles, jax.random.normal(key_rate, shape, lengths.dtype), lengths)
+
+        return sample_free(system, key, n, draw)
+
+
+CP3 = ChainedPendulum("cp3", (0.1, 0.2, 0.15), (0.05, 0.15, 0.1), 0.5, 0.0)
+CP3_E = ChainedPendulum("cp3-e", (0.2, 0.13, 0.15), (0.15, 0.08, 0.1), 0.0, 1.0)
