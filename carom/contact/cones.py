@@ -337,67 +337,75 @@ def _scale(A, v, friction, lower, delta) -> tuple[_Problem, _Scales]:
     Q = S[:, :, None, None] * A * S[None, None]
     Q = Q.at[index[:, None], jnp.arange(d), index[:, None], jnp.arange(d)].add(regularization + floor)
     q = S * v
-    lower = jnp.where(present, lower / jnp.where(present, size, 1), 0)
+    bounded = present & (lower > -jnp.inf)
+    lower = jnp.where(bounded, lower / jnp.where(present, size, 1), 0)
     largest = jnp.maximum(jnp.max(jnp.abs(q), axis=(0, 1)), jnp.max(lower, axis=0))
     unit = jnp.maximum(largest, jnp.finfo(dtype).tiny ** 0.5)
     q = jnp.where(present[:, None], q / unit, jnp.zeros_like(q).at[:, 0].set(1))
-    problem = _Problem(Q.reshape(k * d, k * d, batch), q, lower / unit)
+    lower = jnp.where(bounded, jnp.maximum(lower / unit, _LIFT), _NO_BOUND)
+    problem = _Problem(Q.reshape(k * d, k * d, batch), q, lower)
     return problem, _Scales(S, size, unit, delta, regularization)
 
 
 # A bound at the cone's apex (lower = 0, as for restitution 0) is lifted by this fraction of the problem's scale, so
 # that there the derivative with respect to the bound is the one-sided one for a growing bound: 1, not a blend.
 _LIFT = 1e-10
-# Without a bound, the bound of the scaled problem is here, where the cone keeps the impulse away from it.
+# Where there is no bound, that of the scaled problem is here: the cone keeps the impulse away from it.
 _NO_BOUND = -1.0
 
 
 class _Internal(NamedTuple):
-    """A solution and what its derivative needs, batch first."""
+    """Solutions, batch first."""
 
     impulse: Float[Array, "B K d"]
-    regular: Float[Array, "B K d"]  # (f_n, g_t) of the regularised problem, in physical units
-    inverse: Float[Array, "B n n"]  # (Q + W^-2 + D)^-1, in the units of (f_n, g_t)
-    bound: Float[Array, "B K"]  # D
-    diagonal: Float[Array, " B"]  # delta
     residual: Float[Array, " B"]
     iterations: Int[Array, " B"]
 
 
-def _solve_block(A, v, friction, lower, settings: ConeSettings, bounded: bool) -> _Internal:
+class _Sensitivity(NamedTuple):
+    """What the derivative needs, batch first."""
+
+    regular: Float[Array, "B K d"]  # (f_n, g_t) of the regularised problem, in physical units
+    inverse: Float[Array, "B n n"]  # (Q + W^-2 + D)^-1, in the units of (f_n, g_t)
+    bound: Float[Array, "B K"]  # D
+    diagonal: Float[Array, " B"]  # delta
+
+
+def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: bool):
     """Solve one block of problems: batch first in and out, batch last inside."""
     batch, k, d = v.shape
-    finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction + lower).all(1)
+    n = k * d
+    finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2))
+    finite = finite & jnp.isfinite(friction).all(1) & (lower < jnp.inf).all(1)
     A_last = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
     v_last = jnp.moveaxis(v, 0, -1)
     problem, scales = _scale(A_last, v_last, friction.T, lower.T, settings.diagonal)
-    if bounded:
-        problem = problem._replace(lower=jnp.maximum(problem.lower, _LIFT))
-    else:
-        problem = problem._replace(lower=jnp.full_like(problem.lower, _NO_BOUND))
     one = jnp.ones((k, batch), v.dtype)
     identity = jnp.zeros_like(v_last).at[:, 0].set(1)
     start = _Iterate(_add_normal(identity, jnp.maximum(problem.lower, 0)), one, identity, one)
     start = start._replace(u=start.y[:, 0] - problem.lower)
     loop = _interior_point(problem, start, settings)
     it = loop.best
-
-    n = k * d
-    eye = jnp.broadcast_to(jnp.eye(n, dtype=v.dtype)[..., None], (n, n, batch)).reshape(k, d, n, batch)
-    inverse = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z)).solve(eye).reshape(n, n, batch)
+    matrix = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z))
     # First-order correction for the diagonal: the impulse of the problem as it was given.
-    y = it.y + _matvec(inverse, scales.regularization * it.y)
+    y = it.y + matrix.solve(scales.regularization * it.y)
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
+    solution = _Internal(
+        impulse=jnp.moveaxis(scales.S * scales.unit * y + nan, -1, 0),
+        residual=jnp.where(finite, loop.merit, jnp.inf),
+        iterations=jnp.broadcast_to(loop.iteration, (batch,)),
+    )
+    if not sensitivity:
+        return solution, None
+    eye = jnp.broadcast_to(jnp.eye(n, dtype=v.dtype)[..., None], (n, n, batch)).reshape(k, d, n, batch)
+    inverse = matrix.solve(eye).reshape(n, n, batch)
     size = jnp.broadcast_to(scales.size[:, None], (k, d, batch))
     both = size.reshape(n, 1, batch) * size.reshape(1, n, batch)
-    return _Internal(
-        impulse=jnp.moveaxis(scales.S * scales.unit * y + nan, -1, 0),
+    return solution, _Sensitivity(
         regular=jnp.moveaxis(size * scales.unit * it.y, -1, 0),
         inverse=jnp.moveaxis(inverse * both, -1, 0),
         bound=(it.w / it.u / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
         diagonal=scales.delta,
-        residual=jnp.where(finite, loop.merit, jnp.inf),
-        iterations=jnp.broadcast_to(loop.iteration, (batch,)),
     )
 
 
@@ -406,43 +414,74 @@ def _solve_block(A, v, friction, lower, settings: ConeSettings, bounded: bool) -
 BLOCK = 128
 """Problems solved together: enough to fill vector units, few enough for their matrices to stay in cache."""
 
+SMALL = 2
+"""Contacts up to which a problem of a larger batch is solved in a small form of its own."""
 
-def _solve_batch(A, v, friction, lower, settings: ConeSettings, bounded: bool) -> _Internal:
-    """Solve the problems that have a contact, block by block; the others cost nothing and give zeros."""
+
+def _solve_batch(A, v, friction, lower, settings: ConeSettings, sensitivity: bool):
+    """Solve a batch block by block. Problems without a contact cost nothing and give zeros.
+
+    In a batch with room for many contacts most problems have one or two: these, where they come first in their
+    problem, are solved without the room that they do not use.
+    """
     batch, k, d = v.shape
     n = k * d
-    block = min(BLOCK, batch)
     index = jnp.arange(k)
     diagonal = A.reshape(batch, k, d, k, d)[:, index, 0, index, 0]
-    present = jnp.any(~(diagonal <= 0), axis=1)  # NaN counts as present, so that it is reported
-    order = jnp.nonzero(present, size=-(-batch // block) * block, fill_value=batch)[0]
-    zeros = _Internal(
+    present = ~(diagonal <= 0)  # NaN counts as present, so that it is reported
+    used = jnp.max(jnp.where(present, index + 1, 0), axis=1)
+    out = _Internal(
         impulse=jnp.zeros((batch, k, d), v.dtype),
-        regular=jnp.zeros((batch, k, d), v.dtype),
-        inverse=jnp.zeros((batch, n, n), v.dtype),
-        bound=jnp.zeros((batch, k), v.dtype),
-        diagonal=jnp.zeros(batch, v.dtype),
         residual=jnp.zeros(batch, v.dtype),
         iterations=jnp.zeros(batch, int),
     )
+    extra = None
+    if sensitivity:
+        extra = _Sensitivity(
+            regular=jnp.zeros((batch, k, d), v.dtype),
+            inverse=jnp.zeros((batch, n, n), v.dtype),
+            bound=jnp.zeros((batch, k), v.dtype),
+            diagonal=jnp.zeros(batch, v.dtype),
+        )
+    out = (out, extra)
+    sizes = (SMALL, k) if k > 2 * SMALL else (k,)
+    at_least = 0
+    for size in sizes:
+        chosen = (used > at_least) & (used <= size)
+        out = _solve_chosen(A, v, friction, lower, settings, sensitivity, out, chosen, size)
+        at_least = size
+    return out
+
+
+def _solve_chosen(A, v, friction, lower, settings, sensitivity, out, chosen, size: int):
+    """Solve the `chosen` problems, of which only the first `size` contacts are used, and put them into `out`."""
+    batch, _, d = v.shape
+    m = size * d
+    block = min(BLOCK, batch)
+    order = jnp.nonzero(chosen, size=-(-batch // block) * block, fill_value=batch)[0]
 
     def body(i, out):
         rows = jax.lax.dynamic_slice(order, (i * block,), (block,))
-        data = (x.at[rows].get(mode="fill", fill_value=0) for x in (A, v, friction, lower))
-        solved = _solve_block(*data, settings, bounded)
-        return jax.tree.map(lambda o, s: o.at[rows].set(s, mode="drop"), out, solved)
+        data = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size])
+        data = (x.at[rows].get(mode="fill", fill_value=0) for x in data)
+        solved = _solve_block(*data, settings, sensitivity)
 
-    blocks = (jnp.sum(present) + block - 1) // block
-    return jax.lax.fori_loop(0, blocks, body, zeros)
+        def put(whole, part):
+            return whole.at[(rows, *(slice(0, s) for s in part.shape[1:]))].set(part, mode="drop")
+
+        return jax.tree.map(put, out, solved)
+
+    blocks = (jnp.sum(chosen) + block - 1) // block
+    return jax.lax.fori_loop(0, blocks, body, out)
 
 
 @functools.cache
-def _batched(settings: ConeSettings, bounded: bool):
+def _batched(settings: ConeSettings, sensitivity: bool):
     """`_solve_batch` for these settings, whose batching under vmap is one larger batch."""
 
     @jax.custom_batching.custom_vmap
     def solve(A, v, friction, lower):
-        return _solve_batch(A, v, friction, lower, settings, bounded)
+        return _solve_batch(A, v, friction, lower, settings, sensitivity)
 
     @solve.def_vmap
     def _(size, batched, *arrays):
@@ -478,27 +517,26 @@ def _apply(A, x):
     return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
-def _impulse(A, v, friction, lower, settings: ConeSettings, bounded: bool):
-    out = _batched(settings, bounded)(A, v, friction, lower)
-    return out.impulse, out.residual, out.iterations
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
+def _impulse(A, v, friction, lower, settings: ConeSettings) -> _Internal:
+    return _batched(settings, False)(A, v, friction, lower)[0]
 
 
 # The derivative. At the solution (or at the point of the central path where `smoothing` ends) the conditions
 #
-#     S (A S y + delta S y + v) = z + D (y_n - lower) e_n ...,   y = (f_n, g_t),  f = S y
+#     S (A f + delta f + v) = z + w e_n,   f = S y,   y = (f_n, g_t)
 #
 # with z and w eliminated by their linearised complementarity (dz = -W^-2 dy, dw = -D (dy_n - dlower)) give
 #
-#     (Q + W^-2 + D) dy = -( dS (A f + delta f + v) + S (dA f + dv + (A + delta) dS y) ) + D e_n dlower
+#     (Q + W^-2 + D e_n e_n^T) dy = -( dS (A f + delta f + v) + S (dA f + dv + (A + delta) dS y) ) + D e_n dlower
 #
 # (optimality conditions as in Amos and Kolter, OptNet, 2017, eq. 6, for the cones used here). Everything on the right
 # is linear in the tangents and the matrix is the solver's own, so that both modes, vmap and jit follow from this rule.
 @_impulse.defjvp
-def _impulse_jvp(settings, bounded, primals, tangents):
-    A, v, friction, lower = primals
+def _impulse_jvp(settings, primals, tangents):
+    A, v, friction, _ = primals
     dA, dv, dfriction, dlower = tangents
-    out = _batched(settings, bounded)(A, v, friction, lower)
+    solution, out = _batched(settings, True)(*primals)
     f = _friction_scale(out.regular, friction)
     after = _apply(A, f) + out.diagonal[:, None, None] * f + v
     # Where mu = 0 the tangent g is not determined by the problem. For a growing mu, friction opposes sliding.
@@ -510,11 +548,10 @@ def _impulse_jvp(settings, bounded, primals, tangents):
     dS_after = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * tangent], axis=-1)
     force = _apply(dA, f) + dv + _apply(A, dSy) + out.diagonal[:, None, None] * dSy
     rhs = -(dS_after + _friction_scale(force, friction))
-    if bounded:
-        rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None], rhs[..., 1:]], axis=-1)
+    rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None], rhs[..., 1:]], axis=-1)
     df = dSy + _friction_scale(_apply(out.inverse, rhs), friction)
-    primal = (out.impulse, out.residual, out.iterations)
-    return primal, (df, jnp.zeros_like(out.residual), np.zeros(out.iterations.shape, jax.dtypes.float0))
+    no_tangent = np.zeros(solution.iterations.shape, jax.dtypes.float0)
+    return solution, _Internal(df, jnp.zeros_like(solution.residual), no_tangent)
 
 
 class ConeSolution(NamedTuple):
@@ -542,7 +579,7 @@ def solve_cone_problem(
     **Arguments:** `A` (B, K d, K d), symmetric positive semi-definite, velocity per impulse (1 / kg); `v` (B, K, d),
     velocities of the contact points, normal first (m/s); `friction` (B, K), Coulomb's mu >= 0; `lower` (B, K),
     least normal impulses (N s), >= 0, or `None` for zero; `smoothing`, final value of the complementarity products
-    relative to the problem's scale.
+    relative to the problem's scale. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
     A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is the
     one of least norm. The iterations run in double precision where that is enabled, whatever the dtype of the
@@ -554,7 +591,6 @@ def solve_cone_problem(
     dtype = v.dtype
     settings = ConeSettings.for_dtype(dtype, smoothing)
     work = jnp.promote_types(dtype, jnp.zeros((), float).dtype)
-    bounded = lower is not None
-    low = jnp.zeros_like(friction) if lower is None else lower
-    f, residual, iterations = _impulse(*(x.astype(work) for x in (A, v, friction, low)), settings, bounded)
-    return ConeSolution(f.astype(dtype), residual.astype(dtype), iterations)
+    lower = jnp.full_like(friction, -jnp.inf) if lower is None else lower
+    out = _impulse(*(x.astype(work) for x in (A, v, friction, lower)), settings)
+    return ConeSolution(out.impulse.astype(dtype), out.residual.astype(dtype), out.iterations)

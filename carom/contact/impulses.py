@@ -67,11 +67,18 @@ def contact_impulse(
 
 def two_phases(A, v, friction, restitution, v_star, *, smoothing: float = 0.0) -> tuple[ConeSolution, ConeSolution]:
     """`contact_impulse` without its checks, with the solver's residuals."""
-    compression = _solve(A, v, friction, None, smoothing)
-    change = (A @ compression.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
-    lower = restitution * jnp.maximum(compression.impulse[..., 0], 0)
-    rebound = _solve(A, v + change - v_star, friction, lower, smoothing)
-    return compression, rebound
+
+    # The phases differ in their data alone, so that they are one compiled solve, done twice.
+    def phase(state, is_rebound):
+        velocity, lower = state
+        velocity = velocity - jnp.where(is_rebound, v_star, 0)
+        solution = _solve(A, velocity, friction, jnp.where(is_rebound, lower, -jnp.inf), smoothing)
+        change = (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
+        lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
+        return (velocity + change, lower), solution
+
+    _, solutions = jax.lax.scan(phase, (v, jnp.zeros_like(friction)), jnp.array([False, True]))
+    return jax.tree.map(lambda s: s[0], solutions), jax.tree.map(lambda s: s[1], solutions)
 
 
 def target_velocity(

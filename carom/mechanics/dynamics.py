@@ -30,7 +30,9 @@ class SaddlePoint(eqx.Module):
         self.jacobian, self.inverse_mass = jacobian, inverse_mass
         G = self.to_rows(self.from_impulses(jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)))
         self.operator = lx.MatrixLinearOperator((G + G.T) / 2, lx.positive_semidefinite_tag)
-        self.state = lx.Cholesky().init(self.operator, {})
+        # The derivative of a solve comes from the operator; the factor is only a shortcut to its value.
+        state = lx.Cholesky().init(self.operator, {})
+        self.state = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, state)
 
     def solve(self, rhs: Float[Array, " E"]) -> Float[Array, " E"]:
         """`G^-1 rhs`."""

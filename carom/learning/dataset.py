@@ -1,0 +1,107 @@
+"""Training data: short chunks of recorded trajectories, about half of them with a contact."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from carom.checks import require
+from carom.simulation.files import Recording
+from carom.system import System
+
+
+class Chunks(eqx.Module):
+    """Where chunks of consecutive states may start, by trajectory and by whether a contact falls into them.
+
+    A chunk never starts in contact: the state after an impact alone does not tell what happened.
+    """
+
+    length: int = eqx.field(static=True)  # states in a chunk
+    smooth: tuple[Int[np.ndarray, " *"], ...]  # starts, by trajectory
+    impact: tuple[Int[np.ndarray, " *"], ...]
+
+    @classmethod
+    def of(cls, contact: Bool[np.ndarray, "N T"], valid: Int[np.ndarray, " N"], length: int) -> "Chunks":
+        """All chunks of `length` states in trajectories with `valid` samples each."""
+        smooth, impact = [], []
+        for flags, count in zip(contact, valid, strict=True):
+            starts = np.arange(max(int(count) - length + 1, 0))
+            starts = starts[~flags[starts]]
+            windows = np.lib.stride_tricks.sliding_window_view(flags[:count], length) if len(starts) else flags[:0, None]
+            hit = windows[starts, 1:].any(axis=1) if len(starts) else np.zeros(0, bool)
+            smooth.append(starts[~hit])
+            impact.append(starts[hit])
+        return cls(length, tuple(smooth), tuple(impact))
+
+    def draw(self, rng: np.random.Generator, share: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+        """One chunk of each trajectory that has any: `(trajectory, start)`, with a contact in about `share` of them."""
+        trajectory, start = [], []
+        for k, (smooth, impact) in enumerate(zip(self.smooth, self.impact, strict=True)):
+            pool = impact if len(impact) and (rng.random() < share or not len(smooth)) else smooth
+            if len(pool):
+                trajectory.append(k)
+                start.append(rng.choice(pool))
+        return np.array(trajectory, dtype=np.int32), np.array(start, dtype=np.int32)
+
+    def count(self) -> tuple[int, int]:
+        """Number of chunks without and with a contact."""
+        return sum(map(len, self.smooth)), sum(map(len, self.impact))
+
+
+class Dataset(eqx.Module):
+    """Recordings to learn from: `train` to fit, `val` to stop and choose by.
+
+    Build one from recordings (`load_recording`) or simulated trajectories (`Recording.of`), or let `Dataset.split` divide
+    one recording.
+    """
+
+    train: Recording
+    val: Recording
+
+    def __check_init__(self):
+        require(
+            self.train.x.shape[2:] == self.val.x.shape[2:],
+            f"train and val must be of one system; their points and axes were {self.train.x.shape[2:]} and "
+            f"{self.val.x.shape[2:]}.",
+        )
+        require(
+            abs(self.train.dt - self.val.dt) <= 1e-6 * self.train.dt,
+            f"train and val must have one time step; they had {self.train.dt} s and {self.val.dt} s.",
+        )
+
+    @classmethod
+    def split(cls, recording: Recording, *, val: float = 0.1, seed: int = 0) -> "Dataset":
+        """Divide the trajectories of one recording: a share `val` of them, at least one, for validation."""
+        n = recording.n_trajectories
+        require(n >= 2, f"a recording must have at least 2 trajectories to be split; it had {n}.")
+        require(0 < val < 1, f"val must be a share between 0 and 1; it was {val}.")
+        order = np.random.default_rng(seed).permutation(n)
+        count = min(max(1, round(val * n)), n - 1)
+        return cls(recording.select(np.sort(order[count:])), recording.select(np.sort(order[:count])))
+
+
+def contact_flags(recording: Recording, system: System) -> Bool[np.ndarray, "N T"]:
+    """The recorded contact flags; where there are none, the states in which a gap of `system` is closed."""
+    if recording.contact is not None:
+        return recording.contact
+    return closed_contacts(recording.x, system) > 0
+
+
+def closed_contacts(x: Float[np.ndarray, "N T n d"], system: System) -> Int[np.ndarray, "N T"]:
+    """How many contacts of `system` are closed in each recorded state."""
+    if not system.contacts:
+        return np.zeros(x.shape[:2], int)
+    gaps = eqx.filter_jit(lambda s, x: s.gaps(x))
+    return np.stack([np.asarray(gaps(system, one) < 0).sum(axis=-1) for one in x])
+
+
+def batches(
+    trajectory: np.ndarray, start: np.ndarray, size: int, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Shuffled batches of equal size; the last one is filled up with chunks drawn again."""
+    order = rng.permutation(len(trajectory))
+    missing = -len(order) % size
+    order = np.concatenate([order, rng.choice(order, missing)]) if missing else order
+    for rows in order.reshape(-1, size):
+        yield trajectory[rows], start[rows]

@@ -1,0 +1,442 @@
+"""Figures of a training and of a comparison, as PNG files."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Real
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, LogFormatterMathtext, LogLocator, MaxNLocator
+
+from carom.errors import CaromError
+from carom.view.style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    PALETTE,
+    VERMILLION,
+    figure_style,
+    new_figure,
+    note,
+    save_png,
+)
+
+MOST_NAMED = len(PALETTE)
+"""More properties than this are drawn in one colour."""
+
+NOT_FINITE = 1e300
+"""Stands in for values that are not finite where quantiles are taken."""
+
+LARGEST_ERROR = 1e3
+"""A relative error beyond this says no more than this does."""
+
+
+def learning_curves(metrics: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
+    """Training and validation loss over epochs, with the learning rate below; returns the path of the PNG.
+
+    **Arguments:** `metrics`, one mapping an epoch with `epoch`, `loss`, `val_loss`, `learning_rate`, each of which may
+    be missing, None or NaN. Where an epoch was logged twice, after a resume, the later entry counts.
+
+    **Raises:** `CaromError` for values that are not numbers, or a path that cannot be written.
+    """
+    epochs, rows = _by_epoch(metrics)
+    loss, validation = _series(rows, "loss"), _series(rows, "val_loss")
+    rate = _series(rows, "learning_rate")
+    with figure_style():
+        figure = new_figure(6.4, 4.2)
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
+        drawn = _log_line(top, epochs, loss, color=BLUE, label="training")
+        drawn |= _log_line(top, epochs, validation, color=VERMILLION, label="validation")
+        lost = np.array([row.get("loss", 0.0) for row in rows], dtype=object)
+        broken = epochs[[value is None or not np.isfinite(_number("loss", value)) for value in lost]]
+        if broken.size:
+            top.plot(
+                broken,
+                np.full(broken.size, 0.02),
+                "x",
+                transform=top.get_xaxis_transform(),
+                color=INK,
+                markersize=4,
+                label="loss not finite",
+            )
+        _mark_best(top, epochs, validation)
+        top.set_ylabel("loss")
+        if drawn or broken.size:
+            top.legend(loc="upper right", ncols=3)
+        if not drawn:
+            _empty(top, "no loss was recorded")
+        if not _log_line(bottom, epochs, rate, color=MUTED, linewidth=1.2):
+            _empty(bottom, "no learning rate was recorded")
+        bottom.set_ylabel("learning\nrate")
+        _epoch_axis(bottom, epochs)
+        figure.align_ylabels()
+        return save_png(figure, path)
+
+
+class _Quantity(NamedTuple):
+    """A row of the figure of contact properties; `learned` (epochs, P), `truth` (P,) or None."""
+
+    label: str
+    member: str
+    color: str
+    learned: np.ndarray
+    truth: np.ndarray | None
+    relative: bool
+
+
+def contact_properties(
+    metrics: Sequence[Mapping[str, Any]],
+    truth: Mapping[str, Any] | None,
+    path: str | os.PathLike[str],
+) -> Path:
+    """Friction, restitution and mass ratios over epochs, beside their errors; returns the path of the PNG.
+
+    **Arguments:** `metrics`, one mapping an epoch with `epoch` and the lists `friction`, `restitution` (P,) and
+    `mass_ratio` (bodies,), each of which, and each value in it, may be missing, None or NaN; `truth`, the true lists
+    by the same names, or None: then no errors are shown. Mass ratios are left out where there is one body.
+
+    **Raises:** `CaromError` for values that are not numbers, a truth of another length than what was learned, or a
+    path that cannot be written.
+    """
+    epochs, rows = _by_epoch(metrics)
+    quantities = [
+        quantity
+        for quantity in (
+            _quantity(rows, truth, "friction", "friction  μ", "contact", BLUE),
+            _quantity(rows, truth, "restitution", "restitution  e", "contact", VERMILLION),
+            _quantity(rows, truth, "mass_ratio", "mass ratio  $m_k / m_0$", "body", GREEN),
+        )
+        if quantity.member == "contact" or quantity.learned.shape[1] > 1
+    ]
+    columns = 1 if truth is None else 2
+    with figure_style():
+        figure = new_figure(5.4 if columns == 1 else 9.0, 0.7 + 2.1 * len(quantities))
+        grid = figure.subplots(
+            len(quantities), columns, sharex=True, squeeze=False, width_ratios=[1] * columns
+        )
+        for axes, quantity in zip(grid, quantities, strict=True):
+            _values_panel(axes[0], epochs, quantity)
+            if truth is not None:
+                _error_panel(axes[1], epochs, quantity)
+        for axes in grid[-1]:
+            _epoch_axis(axes, epochs)
+        figure.align_ylabels(grid[:, 0])
+        handles = [Line2D([], [], color=MUTED, label="learned")]
+        if truth is not None:
+            handles.append(Line2D([], [], color=MUTED, linestyle=(0, (4, 2)), linewidth=1.1, label="true"))
+        if truth is not None and any(q.learned.shape[1] > 1 for q in quantities):
+            handles.append(Line2D([], [], color=INK, linewidth=2.2, label="mean error"))
+        figure.legend(handles=handles, loc="outside upper left", ncols=3)
+        return save_png(figure, path)
+
+
+def trajectory_error(
+    time: Real[Array | np.ndarray, " time"],
+    errors: Mapping[str, Float[Array | np.ndarray, "..."]],
+    path: str | os.PathLike[str],
+) -> Path:
+    """Relative error over time: median and the half of the trajectories around it; returns the path of the PNG.
+
+    **Arguments:** `time` (T,) in s; `errors`, by the model's name, (N, T): the relative error of N trajectories. An
+    error that is not finite counts as larger than all others, and the legend says how many trajectories have one.
+
+    **Raises:** `CaromError` for shapes that do not fit, or a path that cannot be written.
+    """
+    seconds, curves = _curves(time, errors, "errors")
+    with figure_style():
+        figure = new_figure(6.4, 4.0)
+        axes = figure.subplots()
+        drawn = False
+        for color, dashes, (name, values) in _styled(curves):
+            lower, median, upper = _quartiles(values)
+            # On a logarithmic axis an exact start has no place: curves begin at the first error.
+            shown = median > 0
+            broken = int(np.sum(~np.isfinite(values).all(axis=1)))
+            label = f"{name} ({broken} of {len(values)} not finite)" if broken else name
+            if _log_line(axes, seconds, median, color=color, linestyle=dashes, label=label):
+                drawn = True
+                if len(values) > 1:
+                    bottom = np.where(lower > 0, lower, np.nanmin(median[shown]) / 10)
+                    _band(axes, seconds, bottom, np.minimum(upper, 1e6), color, shown)
+        if drawn:
+            axes.set_yscale("log")
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, min(high, LARGEST_ERROR))
+            axes.legend(loc="lower right")
+        else:
+            _empty(axes, "no error above zero")
+        axes.set(xlabel="time (s)", ylabel="relative error")
+        if drawn and any(len(values) > 1 for values in curves.values()):
+            axes.set_title("median and interquartile range", color=MUTED, fontsize=8)
+        return save_png(figure, path)
+
+
+def energy(
+    time: Real[Array | np.ndarray, " time"],
+    curves: Mapping[str, Float[Array | np.ndarray, "..."]],
+    path: str | os.PathLike[str],
+) -> Path:
+    """Total energy over time; returns the path of the PNG.
+
+    **Arguments:** `time` (T,) in s; `curves`, by name, in J: (T,), or (N, T) for median and interquartile band. One
+    called "true" is drawn dashed in black, over the others.
+
+    **Raises:** `CaromError` for shapes that do not fit, or a path that cannot be written.
+    """
+    seconds, values = _curves(time, curves, "curves")
+    with figure_style():
+        figure = new_figure(6.4, 3.4)
+        axes = figure.subplots()
+        drawn = False
+        for color, dashes, (name, rows) in _styled(values):
+            lower, median, upper = _quartiles(rows)
+            finite = np.isfinite(median)
+            drawn |= bool(finite.any())
+            axes.plot(
+                seconds[finite],
+                median[finite],
+                color=color,
+                linestyle=dashes,
+                label=name,
+                zorder=3 if color == INK else 2,
+            )
+            if len(rows) > 1:
+                _band(axes, seconds, lower, upper, color, finite & np.isfinite(lower + upper))
+        if drawn:
+            axes.legend(loc="best")
+        else:
+            _empty(axes, "no finite energy")
+        axes.set(xlabel="time (s)", ylabel="energy (J)")
+        return save_png(figure, path)
+
+
+# --- reading the metrics -------------------------------------------------------------------------
+
+
+def _number(key: str, value: Any) -> float:
+    """`value` as a float, None as NaN."""
+    try:
+        return np.nan if value is None else float(value)
+    except (TypeError, ValueError):
+        raise CaromError(f"metrics: {key!r} must be a number or None; one was {value!r}.") from None
+
+
+def _by_epoch(metrics) -> tuple[np.ndarray, list[Mapping[str, Any]]]:
+    """Epochs in order with their entries, the last one of each."""
+    rows = {_number("epoch", row.get("epoch", k)): row for k, row in enumerate(metrics)}
+    epochs = sorted(epoch for epoch in rows if np.isfinite(epoch))
+    return np.array(epochs, dtype=float), [rows[epoch] for epoch in epochs]
+
+
+def _series(rows, key: str) -> np.ndarray:
+    """(epochs,) values of `key`, NaN where there is none."""
+    return np.array([_number(key, row.get(key)) for row in rows], dtype=float)
+
+
+def _list(key: str, value: Any) -> list[float]:
+    if value is None:
+        return []
+    values = value if isinstance(value, Sequence | np.ndarray | Array) else [value]
+    if isinstance(values, str):
+        raise CaromError(f"{key!r} must be a list of numbers; it was {values!r}.")
+    return [_number(key, v) for v in np.asarray(values, dtype=object).reshape(-1)]
+
+
+def _quantity(rows, truth, key: str, label: str, member: str, color: str) -> _Quantity:
+    lists = [_list(key, row.get(key)) for row in rows]
+    width = max(map(len, lists), default=0)
+    learned = np.array([values + [np.nan] * (width - len(values)) for values in lists])
+    true = np.array(_list(key, None if truth is None else truth.get(key)))
+    if width and true.size not in (0, width):
+        raise CaromError(
+            f"truth[{key!r}] must have {width} values, as many as were learned; it had {true.size}."
+        )
+    learned = learned.reshape(len(rows), width)
+    known = bool(np.isfinite(true).any())
+    return _Quantity(label, member, color, learned, true if known else None, key == "mass_ratio")
+
+
+def _curves(time, curves, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """`time` and each curve as (N, T) arrays of floats."""
+    seconds = np.asarray(time, dtype=float)
+    checked = {}
+    for key, values in curves.items():
+        array = np.asarray(values, dtype=float)
+        if seconds.ndim != 1 or array.ndim not in (1, 2) or array.shape[-1] != seconds.size:
+            raise CaromError(
+                f"{name}[{key!r}] must have the shape (N, {seconds.size}), one value for each time; it was "
+                f"{array.shape} and time {seconds.shape}."
+            )
+        checked[key] = np.atleast_2d(array)
+    if not checked or any(array.size == 0 for array in checked.values()):
+        raise CaromError(f"{name} must hold at least one curve of at least one trajectory.")
+    return seconds, checked
+
+
+def _quartiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Quartiles over the first axis; values that are not finite count as the largest, and come out as NaN."""
+    filled = np.where(np.isfinite(values), values, NOT_FINITE)
+    quartiles = np.quantile(filled, [0.25, 0.5, 0.75], axis=0)
+    # Halfway to the stand-in is still far beyond anything that was measured.
+    lower, median, upper = np.where(quartiles > NOT_FINITE * 1e-6, np.nan, quartiles)
+    return lower, median, np.where(np.isnan(upper), np.inf, upper)
+
+
+# --- drawing -------------------------------------------------------------------------------------
+
+
+def _styled(curves: Mapping[str, np.ndarray]):
+    """Colour and dashes for each curve; "true" is dashed ink, and beyond the palette lines are dotted."""
+    others = [name for name in curves if name != "true"]
+    for item in curves.items():
+        if item[0] == "true":
+            yield INK, (0, (4, 2)), item
+        else:
+            turn, k = divmod(others.index(item[0]), len(PALETTE))
+            yield PALETTE[k], ("-", (0, (1, 1.5)), (0, (5, 1.5)))[turn % 3], item
+
+
+def _band(axes: Axes, x, lower, upper, color, where) -> None:
+    axes.fill_between(x, lower, upper, where=where, color=color, alpha=0.16, linewidth=0)
+
+
+def _line(axes: Axes, x: np.ndarray, y: np.ndarray, keep: np.ndarray, **style) -> bool:
+    """Draw the values to keep, as a dot if it is one; whether there were any."""
+    if not keep.any():
+        return False
+    axes.plot(x[keep], y[keep], marker="o" if keep.sum() == 1 else None, markersize=4, **style)
+    return True
+
+
+def _log_line(axes: Axes, x: np.ndarray, y: np.ndarray, **style) -> bool:
+    """Draw the finite positive values on a logarithmic axis; whether there were any."""
+    drawn = _line(axes, x, y, np.isfinite(y) & (y > 0), **style)
+    if drawn:
+        _log_axis(axes)
+    return drawn
+
+
+def _log_axis(axes: Axes) -> None:
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(numticks=6))
+
+
+def _epoch_axis(axes: Axes, epochs: np.ndarray) -> None:
+    axes.set_xlabel("epoch")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=7))
+    if epochs.size == 1:
+        axes.set_xlim(epochs[0] - 1, epochs[0] + 1)
+
+
+def _empty(axes: Axes, text: str) -> None:
+    note(axes, text)
+    axes.set_yticks([])
+
+
+def _mark_best(axes: Axes, epochs: np.ndarray, validation: np.ndarray) -> None:
+    good = np.isfinite(validation) & (validation > 0)
+    if not good.any():
+        return
+    best = np.flatnonzero(good)[np.argmin(validation[good])]
+    axes.plot(
+        epochs[best],
+        validation[best],
+        "o",
+        color=VERMILLION,
+        markersize=6,
+        markeredgecolor="white",
+        markeredgewidth=1.2,
+        zorder=4,
+        label=f"best: {_power(validation[best])}, epoch {epochs[best]:.0f}",
+    )
+
+
+def _power(value: float) -> str:
+    """`value` with two digits, as one writes it: 1.3 x 10^-4."""
+    digits, exponent = f"{value:.1e}".split("e")
+    return rf"${digits} \times 10^{{{int(exponent)}}}$"
+
+
+def _values_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
+    """What was learned as solid lines, the truth as dashed ones."""
+    axes.set_ylabel(quantity.label)
+    count = quantity.learned.shape[1]
+    few = count <= MOST_NAMED
+    drawn = False
+    for k, values in enumerate(quantity.learned.T):
+        style: dict[str, Any] = {"color": _color(quantity, k)}
+        style |= {"label": f"{quantity.member} {k}"} if few else {"linewidth": 0.7, "alpha": 0.6}
+        drawn |= _line(axes, epochs, values, np.isfinite(values), **style)
+    if not drawn:
+        _empty(axes, "none was recorded")
+        return
+    if quantity.truth is not None:
+        for k in np.unique(quantity.truth[np.isfinite(quantity.truth)], return_index=True)[1]:
+            value = quantity.truth[np.isfinite(quantity.truth)][k]
+            axes.axhline(
+                value,
+                color=INK,
+                alpha=0.75 if few else 0.35,
+                linestyle=(0, (4, 2)),
+                linewidth=1.1 if few else 0.7,
+                zorder=3,
+            )
+    if few and count > 1:
+        handles = [
+            Line2D([], [], color=_color(quantity, k), label=f"{quantity.member} {k}") for k in range(count)
+        ]
+        axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.03), handlelength=1.0)
+
+
+def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
+    """Distance from the truth on a logarithmic axis, whose bottom line stands for exact hits."""
+    kind = "relative error" if quantity.relative else "absolute error"
+    axes.set_ylabel(kind)
+    if quantity.truth is None:
+        _empty(axes, "the truth is not known")
+        return
+    error = np.abs(quantity.learned - quantity.truth)
+    if quantity.relative:
+        # The first mass is the unit: it has no error of its own.
+        error = error[:, 1:] / np.abs(quantity.truth[1:])
+    known = np.isfinite(error)
+    if not known.any():
+        _empty(axes, "none was recorded")
+        return
+    mean = np.where(known, error, 0).sum(axis=1) / np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+    positive = error[known & (error > 0)]
+    floor = 10 ** (np.floor(np.log10(positive.min())) - 0.5) if positive.size else 1e-10
+    many = quantity.learned.shape[1] > MOST_NAMED
+    for k, values in enumerate(error.T):
+        style: dict[str, Any] = {"color": _color(quantity, k + quantity.relative)}
+        style |= {"linewidth": 0.7, "alpha": 0.4} if many else {"linewidth": 1.2}
+        _line(axes, epochs, np.maximum(values, floor), np.isfinite(values), clip_on=False, **style)
+    if error.shape[1] > 1:
+        _line(axes, epochs, np.maximum(mean, floor), np.isfinite(mean), color=INK, linewidth=2.2)
+    _log_axis(axes)
+    if (error[known] == 0).any():
+        _show_zero(axes, floor)
+    last = mean[np.isfinite(mean)][-1]
+    text = _power(last) if last > 0 else "0"
+    axes.set_title(f"final {kind}: {text}", fontsize=8, color=MUTED, loc="right")
+
+
+def _show_zero(axes: Axes, floor: float) -> None:
+    """End the axis at `floor` and call it 0: values that are exact have a place."""
+    axes.set_ylim(bottom=floor)
+    low, high = axes.get_ylim()
+    ticks = [tick for tick in LogLocator(numticks=5).tick_values(low, high) if low * 2 < tick <= high]
+    formatter = LogFormatterMathtext()
+    formatter.axis = axes.yaxis  # pyright: ignore
+    axes.yaxis.set_major_locator(FixedLocator([floor, *ticks]))
+    axes.yaxis.set_major_formatter(lambda value, _: "0" if value == floor else formatter(value))
+
+
+def _color(quantity: _Quantity, k: int) -> str:
+    """One colour for one or for many values, a colour each for a few."""
+    count = quantity.learned.shape[1]
+    return PALETTE[k] if 1 < count <= MOST_NAMED else quantity.color

@@ -1,0 +1,134 @@
+"""How carom's figures look, and how they are written: one style, kept apart from matplotlib's global state.
+
+Figures are `matplotlib.figure.Figure` objects drawn by Agg; pyplot is never imported.
+"""
+
+import contextlib
+import os
+import uuid
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import matplotlib.style
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from carom.errors import CaromError
+
+BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
+PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
+PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+"""Okabe and Ito's colours, which people with any kind of colour blindness can tell apart.
+
+Without their yellow, which is too faint for lines on white, and their black, which is for the truth and for text.
+"""
+INK, MUTED, FAINT, SOLID = "#20242B", "#69707B", "#E4E7EB", "#F3F4F6"
+"""Text and truth; less important text; grid; the solid side of walls."""
+PAPER = "#FFFFFF"
+
+DPI = 160
+"""Pixels an inch of the figures."""
+
+_STYLE = {
+    "font.family": "sans-serif",
+    # Comes with matplotlib: the same figure on every machine, and no glyph is missing.
+    "font.sans-serif": ["DejaVu Sans"],
+    "mathtext.fontset": "dejavusans",
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 7.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.edgecolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    "savefig.facecolor": PAPER,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "xtick.major.width": 0.8,
+    "ytick.major.width": 0.8,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "ytick.minor.size": 0.0,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.8,
+    "lines.linewidth": 1.6,
+    "lines.solid_capstyle": "round",
+    "axes.xmargin": 0.02,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "legend.borderaxespad": 0.2,
+    "hatch.linewidth": 0.7,
+}
+
+
+@contextlib.contextmanager
+def figure_style() -> Iterator[None]:
+    """carom's style inside the block, on top of matplotlib's defaults; what was set before is back after it."""
+    with matplotlib.style.context(["default", _STYLE]):
+        yield
+
+
+def new_figure(width: float, height: float, *, dpi: float = DPI, constrained: bool = True) -> Figure:
+    """An empty figure of `width` by `height` inches, drawn by Agg."""
+    figure = Figure((width, height), dpi=dpi, layout="constrained" if constrained else None)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write `figure` at its own dpi and return the path. Nothing half-written is ever seen there.
+
+    **Raises:** `CaromError` for a path that does not end in .png, a missing folder, or one that cannot be written to.
+    """
+    path = checked_path(path, (".png",))
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=figure.dpi, format="png")
+    return path
+
+
+def checked_path(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
+    """`path`, if it ends in one of `suffixes` and its folder exists; else a `CaromError` that says what is wrong."""
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise CaromError(f"path must end in {' or '.join(suffixes)}; it was {str(path)!r}.")
+    if not path.parent.is_dir():
+        raise CaromError(
+            f"path is in the folder {str(path.parent)!r}, which does not exist. Make it, or choose another path."
+        )
+    return path
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path`, which takes its place if the block ends without an error."""
+    temporary = path.with_name(f".{path.stem}-{uuid.uuid4().hex[:12]}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise CaromError(
+            f"path {str(path)!r} cannot be written: {error.strerror or error}. Choose another, or free the place."
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def note(axes: Axes, text: str) -> None:
+    """Say in the middle of an empty panel why it is empty."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=MUTED)

@@ -1,0 +1,75 @@
+"""What every test shares: precision, run-time type checks, compilation cache, the --slow option."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jaxtyping
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+CACHE_DAYS = 14
+
+# The checks are put in while a module is imported, so no module of carom may have been before.
+assert "carom" not in sys.modules, "carom was imported before tests/conftest.py could instrument it"
+jaxtyping.install_import_hook("carom", "beartype.beartype")
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def _use_compilation_cache() -> None:
+    """Keeps compiled programs between runs, outside of the repository: most of a run's time."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cache = caches / "carom-test-jax"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # no writable home: the tests only take longer
+    # jax never removes an entry, and every edit of a function under test leaves one behind.
+    oldest = time.time() - CACHE_DAYS * 86_400
+    for entry in cache.glob("*-cache"):
+        if entry.stat().st_mtime < oldest:
+            entry.unlink(missing_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+_use_compilation_cache()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--slow",
+        choices=("none", "ci", "all"),
+        default="ci",
+        help="which tests marked slow (over 5 s) to run: none, those also marked ci_budget "
+        "(ci, the default), or all",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    chosen = config.getoption("--slow")
+    for item in items:
+        slow = item.get_closest_marker("slow") is not None
+        in_budget = item.get_closest_marker("ci_budget") is not None
+        if in_budget and not slow:
+            raise pytest.UsageError(f"{item.nodeid}: a ci_budget test must be marked slow too")
+        if slow and (chosen == "none" or (chosen == "ci" and not in_budget)):
+            needed = "--slow=ci or --slow=all" if in_budget else "--slow=all"
+            reason = f"slow; run it with {needed} (this run: --slow={chosen})"
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture(scope="session")
+def reference_dir() -> Path:
+    """The folder of recorded data that carom did not make; skips where it is not at hand."""
+    named = os.environ.get("CAROM_REFERENCE_DATA")
+    folder = Path(named) if named else REPOSITORY.parent / "shared" / "data"
+    if folder.is_dir():
+        return folder
+    if named:
+        pytest.fail(f"CAROM_REFERENCE_DATA is {named!r}, which is not a folder", pytrace=False)
+    pytest.skip("no reference data; set CAROM_REFERENCE_DATA to its folder")
