@@ -1,5 +1,6 @@
 """The System: bodies, constraints, contacts, potential and contact properties in one pytree."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -97,6 +98,14 @@ class System(eqx.Module):
             count == 0 or self.max_active > 0,
             f"max_active must be at least 1 in a system with contacts; it was {max_active}.",
         )
+
+    def with_max_active(self, max_active: int) -> "System":
+        """The same system with room for another number of closed contacts in the solver."""
+        new = object.__new__(System)
+        for field in dataclasses.fields(self):
+            object.__setattr__(new, field.name, getattr(self, field.name))
+        object.__setattr__(new, "max_active", max(1, min(max_active, self.n_candidates)))
+        return new
 
     # --- structure -------------------------------------------------------------------------------------------
 
@@ -226,7 +235,7 @@ def _properties(friction, restitution, index):
     require_values("restitution", restitution, (restitution >= 0) & (restitution <= 1), "between 0 and 1")
     if is_known(friction):
         require(
-            index.size == 0 or (index.min() >= 0 and index.max() < count),
+            index.size == 0 or bool(index.min() >= 0 and index.max() < count),
             f"a contact's property index must be below the number of friction values ({count}); one was "
             f"{index.max() if index.size else 0}. Give one friction and restitution for each property.",
         )

@@ -1,0 +1,1 @@
+"""The command `carom`: one file a subcommand."""

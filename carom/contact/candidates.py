@@ -30,9 +30,7 @@ class Contact(eqx.Module):
     property_index: eqx.AbstractVar[tuple[int, ...]]
 
     @abc.abstractmethod
-    def candidates(
-        self, x: Float[Array, "n d"], radii: Float[Array, " bodies"], table: BodyTable
-    ) -> Candidates:
+    def candidates(self, x: Float[Array, "n d"], radii: Float[Array, " bodies"], table: BodyTable) -> Candidates:
         """Gaps and Jacobian of this family's candidates, in a fixed order."""
 
     @abc.abstractmethod
@@ -153,9 +151,7 @@ class Active(NamedTuple):
     overflow: Int[Array, ""]
 
 
-def active_set(
-    candidates: Candidates, property_index: Int[np.ndarray, " C"], max_active: int
-) -> Active:
+def active_set(candidates: Candidates, property_index: Int[np.ndarray, " C"], max_active: int) -> Active:
     """Choose the closed contacts (`gap < 0`), deepest first; Jacobian rows of the others are zero."""
     closed = candidates.gap < 0
     order = jnp.argsort(candidates.gap)[:max_active]

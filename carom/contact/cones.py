@@ -168,9 +168,7 @@ class _NewtonMatrix:
         rotated = self.rotated[:, None, None]
         eigenvectors = jnp.where(rotated, eye, scaling.restore(eye))  # [:, :, j] = r_j
         normal = self.rotate(eye[:, :, 0])
-        block = jnp.sum(
-            (scaling.inverse**2)[:, None, None] * eigenvectors[:, :, None] * eigenvectors[:, None], axis=3
-        )
+        block = jnp.sum((scaling.inverse**2)[:, None, None] * eigenvectors[:, :, None] * eigenvectors[:, None], axis=3)
         block = block + curvature[:, None, None] * normal[:, :, None] * normal[:, None, :]
         index = jnp.arange(k)
         H = H.at[index, :, index].add(block)

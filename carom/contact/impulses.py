@@ -133,7 +133,9 @@ def _check_problem(A, v, *, friction, **others):
     for name, value in others.items():
         shapes[name] = (value, (*batch, k, d) if name == "v_star" else (*batch, k))
     for name, (value, shape) in shapes.items():
-        require(value.shape == shape, f"{name} must have the shape {shape} to go with v {v.shape}; it was {value.shape}.")
+        require(
+            value.shape == shape, f"{name} must have the shape {shape} to go with v {v.shape}; it was {value.shape}."
+        )
     for name, value in {"A": A, "v": v, "friction": friction, **others}.items():
         require_values(name, value, jnp.isfinite(value), "finite")
         if name not in ("A", "v", "v_star"):

@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from carom.checks import require
 from carom.simulation.files import Recording
+from carom.simulation.rollout import Trajectory
 from carom.system import System
 
 
@@ -28,21 +30,28 @@ class Chunks(eqx.Module):
         for flags, count in zip(contact, valid, strict=True):
             starts = np.arange(max(int(count) - length + 1, 0))
             starts = starts[~flags[starts]]
-            windows = np.lib.stride_tricks.sliding_window_view(flags[:count], length) if len(starts) else flags[:0, None]
+            windows = (
+                np.lib.stride_tricks.sliding_window_view(flags[:count], length) if len(starts) else flags[:0, None]
+            )
             hit = windows[starts, 1:].any(axis=1) if len(starts) else np.zeros(0, bool)
             smooth.append(starts[~hit])
             impact.append(starts[hit])
         return cls(length, tuple(smooth), tuple(impact))
 
-    def draw(self, rng: np.random.Generator, share: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-        """One chunk of each trajectory that has any: `(trajectory, start)`, with a contact in about `share` of them."""
-        trajectory, start = [], []
-        for k, (smooth, impact) in enumerate(zip(self.smooth, self.impact, strict=True)):
+    def draw(self, rng: np.random.Generator, count: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """`count` chunks `(trajectory, start)`, spread evenly over the trajectories.
+
+        About `share` of them hold a contact, as far as their trajectories have any.
+        """
+        drawable = [k for k in range(len(self.smooth)) if len(self.smooth[k]) or len(self.impact[k])]
+        rounds = -(-count // len(drawable))
+        trajectory = np.concatenate([rng.permutation(drawable) for _ in range(rounds)])[:count]
+        start = []
+        for k in trajectory:
+            smooth, impact = self.smooth[k], self.impact[k]
             pool = impact if len(impact) and (rng.random() < share or not len(smooth)) else smooth
-            if len(pool):
-                trajectory.append(k)
-                start.append(rng.choice(pool))
-        return np.array(trajectory, dtype=np.int32), np.array(start, dtype=np.int32)
+            start.append(rng.choice(pool))
+        return trajectory.astype(np.int32), np.array(start, dtype=np.int32)
 
     def count(self) -> tuple[int, int]:
         """Number of chunks without and with a contact."""
@@ -92,16 +101,42 @@ def closed_contacts(x: Float[np.ndarray, "N T n d"], system: System) -> Int[np.n
     """How many contacts of `system` are closed in each recorded state."""
     if not system.contacts:
         return np.zeros(x.shape[:2], int)
+    return np.stack([(gaps < 0).sum(axis=-1) for gaps in _all_gaps(x, system)])
+
+
+def _all_gaps(x: Float[np.ndarray, "N T n d"], system: System) -> Iterator[Float[np.ndarray, "T C"]]:
     gaps = eqx.filter_jit(lambda s, x: s.gaps(x))
-    return np.stack([np.asarray(gaps(system, one) < 0).sum(axis=-1) for one in x])
+    return (np.asarray(gaps(system, jnp.asarray(one))) for one in x)
 
 
-def batches(
-    trajectory: np.ndarray, start: np.ndarray, size: int, rng: np.random.Generator
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Shuffled batches of equal size; the last one is filled up with chunks drawn again."""
-    order = rng.permutation(len(trajectory))
-    missing = -len(order) % size
-    order = np.concatenate([order, rng.choice(order, missing)]) if missing else order
-    for rows in order.reshape(-1, size):
-        yield trajectory[rows], start[rows]
+def count_touches(recording: Recording, system: System) -> Int[np.ndarray, " P"]:
+    """How many recorded states close a contact of each contact property."""
+    out = np.zeros(system.n_properties, int)
+    if not system.contacts:
+        return out
+    index = np.array([p for contact in system.contacts for p in contact.property_index])
+    valid = np.arange(recording.x.shape[1]) < recording.length[:, None]
+    closed = np.concatenate([g[ok] < 0 for g, ok in zip(_all_gaps(recording.x, system), valid, strict=True)])
+    np.add.at(out, index, closed.sum(axis=0))
+    return out
+
+
+def recording_of(trajectory: Trajectory, *, task: str = "", source: str = "") -> Recording:
+    """A batch of simulated trajectories as a recording, to learn from or to write to a file."""
+    return Recording.of(
+        trajectory.x, trajectory.v, time=trajectory.time, contact=trajectory.contact, task=task, source=source
+    )
+
+
+def trajectory_of(recording: Recording, k: int) -> Trajectory:
+    """Trajectory number `k` of a recording, up to its own length."""
+    count = int(recording.length[k])
+    contact = np.zeros(count, bool) if recording.contact is None else recording.contact[k, :count]
+    return Trajectory(
+        x=jnp.asarray(recording.x[k, :count]),
+        v=jnp.asarray(recording.v[k, :count]),
+        contact=jnp.asarray(contact),
+        time=jnp.asarray(recording.time[:count]),
+        overflow=jnp.zeros(count, int),
+        residual=jnp.zeros(count),
+    )

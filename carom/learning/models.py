@@ -59,9 +59,7 @@ class Unknowns(eqx.Module):
         if self.log_mass_ratio is not None:
             ratio = jnp.concatenate([jnp.zeros(1, self.log_mass_ratio.dtype), self.log_mass_ratio])
             masses = skeleton.bodies[0].mass * jnp.exp(ratio)
-            bodies = tuple(
-                _with_mass(body, mass) for body, mass in zip(skeleton.bodies, masses, strict=True)
-            )
+            bodies = tuple(_with_mass(body, mass) for body, mass in zip(skeleton.bodies, masses, strict=True))
             system = eqx.tree_at(lambda s: s.bodies, system, bodies)
         for name in ("friction", "restitution", "potential"):
             value = getattr(self, name)

@@ -1,9 +1,8 @@
 """The trainer: one for every system and model. `learn` fits the unknowns of a skeleton to a dataset."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal
 
 import equinox as eqx
@@ -14,10 +13,11 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from carom.checks import require
-from carom.contact.cones import ConeSettings
-from carom.learning.dataset import Chunks, Dataset, batches, closed_contacts, contact_flags
+from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
+from carom.learning.progress import TrainingProgress
 from carom.learning.run import RunFolder
+from carom.simulation.files import Recording
 from carom.simulation.rollout import COMPENSATION_STEPS, Stepper, step
 from carom.system import System
 
@@ -35,7 +35,9 @@ class LearnConfig:
     learn: tuple[Quantity, ...] = ("mass", "friction", "restitution", "potential")
     """What is unknown; all else is taken from the skeleton."""
     epochs: int = 250
-    """Passes over the training trajectories; each draws a new chunk of every trajectory."""
+    """How often `chunks_per_epoch` chunks are drawn and learned from."""
+    chunks_per_epoch: int = 800
+    """Chunks drawn in an epoch, spread evenly over the trajectories."""
     batch_size: int = 200
     """Chunks in a step of the optimiser."""
     chunk_length: int = 5
@@ -66,7 +68,7 @@ class LearnConfig:
     """Epochs between checkpoints."""
 
     def __post_init__(self):
-        for name in ("epochs", "batch_size", "patience", "width", "depth", "checkpoint_every"):
+        for name in ("epochs", "chunks_per_epoch", "batch_size", "patience", "width", "depth", "checkpoint_every"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
         require(self.chunk_length >= 2, f"chunk_length must be at least 2 states; it was {self.chunk_length}.")
         require(0 <= self.contact_share <= 1, f"contact_share must be in [0, 1]; it was {self.contact_share}.")
@@ -202,3 +204,200 @@ def train_step(data, unknowns, opt_state, optimizer, stepper, length):
 def validate(unknowns, skeleton, x, v, stepper):
     """Loss of chunks that are not trained on."""
     return chunk_loss(unknowns, skeleton, stepper, x, v)[0]
+
+
+def fresh_state(skeleton: System, config: LearnConfig, steps: int) -> tuple[TrainState, optax.GradientTransformation]:
+    """The state before the first epoch, and the optimiser."""
+    unknowns = initial_unknowns(skeleton, config)
+    optimizer = make_optimizer(config, steps, unknowns)
+    with jax.numpy_dtype_promotion("standard"):
+        opt_state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
+    zero = jnp.asarray(0)
+    infinity = jnp.asarray(jnp.inf)
+    return TrainState(unknowns, opt_state, unknowns, infinity, zero, zero, zero, zero), optimizer
+
+
+def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
+    """Raise `CaromError` where data and skeleton do not fit; return the largest number of contacts closed at once."""
+    shape = (skeleton.n_points, skeleton.dim)
+    require(
+        dataset.train.x.shape[2:] == shape,
+        f"the data have {dataset.train.x.shape[2]} points in {dataset.train.x.shape[3]}D, the system has {shape[0]} in "
+        f"{shape[1]}D. Is this a file of another task?",
+    )
+    require(
+        int(dataset.train.length.max()) >= config.chunk_length,
+        f"chunk_length is {config.chunk_length} states, but the longest training trajectory has "
+        f"{int(dataset.train.length.max())}. Use longer trajectories or a shorter chunk.",
+    )
+    most = 0
+    for name, part in (("train", dataset.train), ("val", dataset.val)):
+        valid = np.arange(part.x.shape[1]) < part.length[:, None]
+        drift = np.abs(np.asarray(skeleton.constraints(jnp.asarray(part.x[valid]))))
+        limit = 5e-2
+        require(
+            drift.size == 0 or drift.max() <= limit,
+            f"the {name} data do not fit the system's rods and joints: a constraint is off by "
+            f"{drift.max() if drift.size else 0:.2g} m^2. Check units, order of the points and lengths.",
+        )
+        most = max(most, int(np.where(valid, closed_contacts(part.x, skeleton), 0).max()))
+        check_not_inside(name, part, skeleton, valid)
+    return most
+
+
+def check_not_inside(name: str, part: Recording, skeleton: System, valid: np.ndarray) -> None:
+    """Raise `CaromError` for recorded states with a body in a wall, or bodies through each other."""
+    if not skeleton.contacts:
+        return
+    gaps = np.asarray(skeleton.gaps(jnp.asarray(part.x[valid])))
+    through = gaps < -np.asarray(skeleton.reach()) - 1e-9
+    if through.any():
+        row, candidate = np.argwhere(through)[0]
+        trajectory, sample = np.argwhere(valid)[row]
+        bodies = [b for contact in skeleton.contacts for b in contact.bodies_of()][candidate]
+        what = (
+            f"body {bodies[0]} in a wall" if len(bodies) == 1 else f"bodies {bodies[0]} and {bodies[1]} in each other"
+        )
+        require(
+            False,
+            f"the {name} data have {what} (trajectory {trajectory}, sample {sample}, {-gaps[row, candidate]:.3g} m deep, "
+            f"{int(through.any(axis=1).sum())} samples in all). Check units, radii and walls.",
+        )
+
+
+def learn(
+    skeleton: System,
+    dataset: Dataset,
+    config: LearnConfig | None = None,
+    *,
+    run: RunFolder | None = None,
+    progress: bool = True,
+) -> tuple[System, LearnReport]:
+    """Learn the unknowns of `skeleton` from `dataset`: a System like it, with a neural potential and learned numbers.
+
+    **Arguments:**
+
+    - `skeleton`: bodies, constraints and contacts with their geometry. Its masses (but that of the first body, the unit of
+      all), potential, friction and restitution are not used where `config.learn` names them.
+    - `dataset`: training and validation recordings.
+    - `config`: how; see `LearnConfig`.
+    - `run`: a folder to keep metrics and checkpoints in. If it holds a checkpoint, the training goes on from there.
+    - `progress`: show it.
+
+    **Returns:** the learned system (of the best validation loss), and a report.
+
+    **Raises:** `CaromError` if data, skeleton and configuration do not fit, or the loss stays not finite.
+    """
+    config = LearnConfig() if config is None else config
+    most = check_dataset(skeleton, dataset, config)
+    # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
+    trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
+    train, val = dataset.train, dataset.val
+    chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.chunk_length)
+    smooth, impact = chunks.count()
+    require(smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from.")
+    steps = -(-config.chunks_per_epoch // config.batch_size)  # in an epoch
+    state, optimizer = fresh_state(skeleton, config, config.epochs * steps)
+    restored = run.restore_checkpoint(state) if run is not None else None
+    if run is not None and restored is not None:
+        state = restored
+        run.rewind_metrics(int(state.epoch))
+    stepper = Stepper(
+        dt=jnp.asarray(train.dt),
+        formulation=FORMULATIONS[config.model],
+        project=config.project,
+        compensation_steps=config.compensation_steps,
+    )
+    x, v = jnp.asarray(train.x), jnp.asarray(train.v)
+    held_out = _validation_chunks(val, skeleton, config)
+    before = run.metrics()[-1]["seconds"] if restored is not None and run.metrics() else 0.0
+    started = time.monotonic() - before
+    loss = jnp.asarray(jnp.nan)
+    stopped = False
+    with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
+        for epoch in range(int(state.epoch) + 1, config.epochs + 1):
+            state, loss = _epoch(state, epoch, trained, x, v, chunks, optimizer, stepper, config)
+            val_loss = validate(state.unknowns, trained, *held_out, stepper)
+            state = _keep_best(state, val_loss, epoch)
+            rate = config.learning_rate * (1 + np.cos(np.pi * epoch / config.epochs)) / 2
+            metrics = {
+                "epoch": epoch,
+                "step": epoch * steps,
+                "seconds": round(time.monotonic() - started, 3),
+                "loss": float(loss),
+                "val_loss": float(val_loss),
+                "learning_rate": float(rate),
+                **quantities(state.unknowns.assemble(skeleton)),
+                "skipped_steps": int(state.skipped),
+                "overflowed_contacts": int(state.overflow),
+            }
+            if run is not None:
+                run.log(metrics)
+                if epoch % config.checkpoint_every == 0 or epoch == config.epochs:
+                    run.save_checkpoint(epoch, state)
+            if shown is not None:
+                shown.update(metrics)
+            require(
+                bool(jnp.isfinite(loss)) or epoch < 3 or not np.isinf(float(state.best_loss)),
+                f"the training loss is not finite ({int(state.skipped)} steps left out). Check the data, or lower "
+                "learning_rate.",
+            )
+            if epoch - int(state.best_epoch) >= config.patience:
+                stopped = True
+                break
+    system = state.best.assemble(skeleton)
+    report = LearnReport(
+        **quantities(system),
+        train_loss=float(loss),
+        val_loss=float(state.best_loss),
+        epochs=int(state.epoch),
+        seconds=time.monotonic() - started,
+        stopped_early=stopped,
+        skipped_steps=int(state.skipped),
+        overflowed_contacts=int(state.overflow),
+    )
+    return system, report
+
+
+def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
+    """A fixed draw of one batch of chunks, evenly from the validation trajectories."""
+    rng = np.random.default_rng((config.seed, 1))
+    chunks = Chunks.of(contact_flags(val, skeleton), val.length, config.chunk_length)
+    require(sum(chunks.count()) > 0, "the validation data have no chunk that starts without contact.")
+    trajectory, start = chunks.draw(rng, config.batch_size, config.contact_share)
+    return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.chunk_length)
+
+
+def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, stepper, config):
+    """Learn from `chunks_per_epoch` new chunks. Their choice depends on seed and epoch alone, so that it can resume."""
+    rng = np.random.default_rng((config.seed, 0, epoch))
+    unknowns, opt_state = state.unknowns, state.optimizer
+    losses, overflow, skipped = [], state.overflow, state.skipped
+    drawn = chunks.draw(rng, config.chunks_per_epoch, config.contact_share)
+    for first in range(0, config.chunks_per_epoch, config.batch_size):
+        trajectory, start = (part[first : first + config.batch_size] for part in drawn)
+        data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
+        unknowns, opt_state, loss, over, bad = train_step(
+            data, unknowns, opt_state, optimizer, stepper, config.chunk_length
+        )
+        losses.append(loss)
+        overflow, skipped = overflow + over, skipped + bad
+    state = dataclasses.replace(
+        state, unknowns=unknowns, optimizer=opt_state, epoch=jnp.asarray(epoch), overflow=overflow, skipped=skipped
+    )
+    return state, jnp.mean(jnp.stack(losses))
+
+
+def _keep_best(state: TrainState, val_loss, epoch: int) -> TrainState:
+    if not float(val_loss) < float(state.best_loss):
+        return state
+    return dataclasses.replace(state, best=state.unknowns, best_loss=val_loss, best_epoch=jnp.asarray(epoch))
+
+
+def quantities(system: System) -> dict[str, list[float]]:
+    """The physical quantities of a system, for metrics and reports."""
+    return {
+        "friction": np.asarray(system.friction).tolist(),
+        "restitution": np.asarray(system.restitution).tolist(),
+        "mass_ratio": mass_ratios(system).tolist(),
+    }

@@ -127,9 +127,7 @@ class BodyTable(eqx.Module):
 
 def embed_pose(position: Float[Array, "*b d"], rotation: Float[Array, "*b d d"]) -> Float[Array, "*b p d"]:
     """Points `(d + 1, d)` of a rigid body at `position` (m) with `rotation` (body to world; columns are the axes)."""
-    return jnp.concatenate(
-        [position[..., None, :], position[..., None, :] + jnp.swapaxes(rotation, -1, -2)], axis=-2
-    )
+    return jnp.concatenate([position[..., None, :], position[..., None, :] + jnp.swapaxes(rotation, -1, -2)], axis=-2)
 
 
 def embed_velocity(

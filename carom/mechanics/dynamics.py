@@ -52,9 +52,7 @@ class SaddlePoint(eqx.Module):
         return velocity - self.from_impulses(multipliers)
 
 
-def saddle_point(
-    constraints: Callable, x: Float[Array, "n d"], inverse_mass: Float[Array, "n n"]
-) -> SaddlePoint:
+def saddle_point(constraints: Callable, x: Float[Array, "n d"], inverse_mass: Float[Array, "n n"]) -> SaddlePoint:
     """The saddle-point problem of the constraints at `x`."""
     return SaddlePoint(jax.jacrev(constraints)(x), inverse_mass)
 

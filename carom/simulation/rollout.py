@@ -60,9 +60,7 @@ class StepResult(eqx.Module):
     residual: Float[Array, ""]
 
 
-def step(
-    system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None
-) -> StepResult:
+def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None) -> StepResult:
     """Integrate one whole step, then let the contacts act that are closed at its end (the paper's rule)."""
     inverse_mass = system.inverse_mass_matrix()
     field = FIELDS[stepper.formulation]
@@ -104,9 +102,7 @@ def impact(
     if stepper.compensation_steps is not None:
         joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
         depth = jnp.where(active.active, -active.gap, 0)
-        v_star = target_velocity(
-            active.jacobian, depth, joints, time=stepper.dt * stepper.compensation_steps
-        )
+        v_star = target_velocity(active.jacobian, depth, joints, time=stepper.dt * stepper.compensation_steps)
     compression, rebound = two_phases(
         delassus,
         velocity,
@@ -195,7 +191,9 @@ def simulate(
     x0, v0 = as_floats(x0), as_floats(v0)
     require(impact == "step", f'impact must be "step"; it was {impact!r}.')
     require(formulation in FIELDS, f"formulation must be one of {sorted(FIELDS)}; it was {formulation!r}.")
-    require(isinstance(steps, int | np.integer) and steps > 0, f"steps must be a positive whole number; it was {steps}.")
+    require(
+        isinstance(steps, int | np.integer) and steps > 0, f"steps must be a positive whole number; it was {steps}."
+    )
     require_values("dt", dt, np.asarray(dt) > 0 if is_known(dt) else True, "a positive number of seconds")
     require(
         compensation_steps is None or compensation_steps > 0,

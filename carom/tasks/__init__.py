@@ -1,10 +1,16 @@
 """The named systems. A new one is a `Task` object, listed here."""
 
 import difflib
+import os
+from pathlib import Path
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from carom.checks import require
+from carom.learning.dataset import recording_of
+from carom.learning.model_file import load_model_into, read_model_header
+from carom.simulation.files import Recording
+from carom.simulation.rollout import simulate
 from carom.system import System
 from carom.tasks.base import Task as Task
 from carom.tasks.bouncing import BP5, BP5_E
@@ -29,9 +35,7 @@ def task(name: str) -> System:
     return find_task(name).system()
 
 
-def sample(
-    system: System, key: PRNGKeyArray, n: int
-) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
+def sample(system: System, key: PRNGKeyArray, n: int) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
     """`n` initial states `(x0, v0)` of a task's system, from the task's own distribution; none starts in contact.
 
     **Arguments:** `system`, from `carom.task` (or one learned for a task); `key`, a JAX random key; `n`, how many.
@@ -44,3 +48,25 @@ def sample(
     )
     require(n > 0, f"n must be a positive number of states; it was {n}.")
     return find_task(system.name).sample(system, key, n)
+
+
+def make_recording(system: System, key: PRNGKeyArray, n: int) -> Recording:
+    """`n` simulated trajectories of a task's system, at the task's time step and length."""
+    x0, v0 = sample(system, key, n)
+    chosen = find_task(system.name)
+    trajectory = simulate(system, x0, v0, dt=chosen.dt, steps=chosen.steps)
+    return recording_of(trajectory, task=system.name, source="carom")
+
+
+def load_model(path: str | os.PathLike, skeleton: System | None = None) -> System:
+    """The learned system of a `model.carom` file.
+
+    **Arguments:** `path`, of the file; `skeleton`, the system it was learned with, needed where that is no named task.
+
+    **Raises:** `CaromError` if the file cannot be read, is damaged, or does not fit.
+    """
+    if skeleton is None:
+        name = read_model_header(Path(path))["task"]
+        require(name != "", f"the model {path} is of a system of your own: give the skeleton it was learned with.")
+        skeleton = task(name)
+    return load_model_into(Path(path), skeleton)

@@ -25,9 +25,7 @@ class Task(eqx.Module):
         """The system, with its true parameters."""
 
     @abc.abstractmethod
-    def sample(
-        self, system: System, key: PRNGKeyArray, n: int
-    ) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
+    def sample(self, system: System, key: PRNGKeyArray, n: int) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
         """`n` initial states: positions (m) and velocities (m/s)."""
 
 

@@ -20,9 +20,7 @@ def box_contacts(n: int, *, individual: bool) -> list[Contact]:
     contacts: list[Contact] = [DiskDisk(pairs, property=range(len(pairs)) if individual else 0)]
     for k, (point, normal) in enumerate(BOX_WALLS):
         first = len(pairs) + k * n
-        contacts.append(
-            DiskPlane(range(n), point, normal, property=range(first, first + n) if individual else 0)
-        )
+        contacts.append(DiskPlane(range(n), point, normal, property=range(first, first + n) if individual else 0))
     return contacts
 
 

@@ -22,11 +22,17 @@ from carom.view.style import (
     figure_style,
     new_figure,
     note,
+    power,
     save_png,
 )
 
 MOST_NAMED = len(PALETTE)
-"""More properties than this are drawn in one colour."""
+"""More properties than this are drawn in one color."""
+
+SMALLEST_SPAN = 0.1
+"""What the axis of a property spans at least: smaller changes are for the panel of errors."""
+
+DASHES = (0, (4, 2))
 
 NOT_FINITE = 1e300
 """Stands in for values that are not finite where quantiles are taken."""
@@ -36,10 +42,11 @@ LARGEST_ERROR = 1e3
 
 
 def learning_curves(metrics: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Training and validation loss over epochs, with the learning rate below; returns the path of the PNG.
+    """Training and validation loss and learning rate over epochs; returns the PNG's path.
 
-    **Arguments:** `metrics`, one mapping an epoch with `epoch`, `loss`, `val_loss`, `learning_rate`, each of which may
-    be missing, None or NaN. Where an epoch was logged twice, after a resume, the later entry counts.
+    **Arguments:** `metrics`, one mapping an epoch with `epoch`, `loss`, `val_loss`,
+    `learning_rate`, each of which may be missing, None or NaN. Where an epoch was logged twice,
+    after a resume, the later entry counts.
 
     **Raises:** `CaromError` for values that are not numbers, or a path that cannot be written.
     """
@@ -66,10 +73,14 @@ def learning_curves(metrics: Sequence[Mapping[str, Any]], path: str | os.PathLik
         _mark_best(top, epochs, validation)
         top.set_ylabel("loss")
         if drawn or broken.size:
-            top.legend(loc="upper right", ncols=3)
+            top.legend(loc="upper right", ncols=2)
         if not drawn:
             _empty(top, "no loss was recorded")
-        if not _log_line(bottom, epochs, rate, color=MUTED, linewidth=1.2):
+        if _line(bottom, epochs, rate, np.isfinite(rate), color=MUTED, linewidth=1.2):
+            bottom.set_ylim(bottom=0)
+            bottom.yaxis.set_major_locator(MaxNLocator(nbins=2, min_n_ticks=2))
+            bottom.ticklabel_format(axis="y", scilimits=(-2, 2), useMathText=True)
+        else:
             _empty(bottom, "no learning rate was recorded")
         bottom.set_ylabel("learning\nrate")
         _epoch_axis(bottom, epochs)
@@ -93,14 +104,15 @@ def contact_properties(
     truth: Mapping[str, Any] | None,
     path: str | os.PathLike[str],
 ) -> Path:
-    """Friction, restitution and mass ratios over epochs, beside their errors; returns the path of the PNG.
+    """Friction, restitution, mass ratios and their errors over epochs; returns the PNG's path.
 
-    **Arguments:** `metrics`, one mapping an epoch with `epoch` and the lists `friction`, `restitution` (P,) and
-    `mass_ratio` (bodies,), each of which, and each value in it, may be missing, None or NaN; `truth`, the true lists
-    by the same names, or None: then no errors are shown. Mass ratios are left out where there is one body.
+    **Arguments:** `metrics`, one mapping an epoch with `epoch` and the lists `friction`,
+    `restitution` (P,) and `mass_ratio` (bodies,), each of which, and each value in it, may be
+    missing, None or NaN; `truth`, the true lists by the same names, or None: then no errors are
+    shown. Mass ratios are left out where there is one body.
 
-    **Raises:** `CaromError` for values that are not numbers, a truth of another length than what was learned, or a
-    path that cannot be written.
+    **Raises:** `CaromError` for values that are not numbers, a truth of another length than what
+    was learned, or a path that cannot be written.
     """
     epochs, rows = _by_epoch(metrics)
     quantities = [
@@ -115,22 +127,23 @@ def contact_properties(
     columns = 1 if truth is None else 2
     with figure_style():
         figure = new_figure(5.4 if columns == 1 else 9.0, 0.7 + 2.1 * len(quantities))
-        grid = figure.subplots(
-            len(quantities), columns, sharex=True, squeeze=False, width_ratios=[1] * columns
-        )
+        grid = figure.subplots(len(quantities), columns, sharex=True, squeeze=False)
         for axes, quantity in zip(grid, quantities, strict=True):
             _values_panel(axes[0], epochs, quantity)
             if truth is not None:
                 _error_panel(axes[1], epochs, quantity)
+            _name_lines(axes[-1], quantity)
         for axes in grid[-1]:
             _epoch_axis(axes, epochs)
         figure.align_ylabels(grid[:, 0])
-        handles = [Line2D([], [], color=MUTED, label="learned")]
         if truth is not None:
-            handles.append(Line2D([], [], color=MUTED, linestyle=(0, (4, 2)), linewidth=1.1, label="true"))
-        if truth is not None and any(q.learned.shape[1] > 1 for q in quantities):
-            handles.append(Line2D([], [], color=INK, linewidth=2.2, label="mean error"))
-        figure.legend(handles=handles, loc="outside upper left", ncols=3)
+            handles = [
+                Line2D([], [], color=MUTED, label="learned"),
+                Line2D([], [], color=MUTED, linestyle=DASHES, linewidth=1.1, label="true"),
+            ]
+            if any(_is_crowded(q) for q in quantities):
+                handles.append(Line2D([], [], color=INK, linewidth=2, label="mean error"))
+            figure.legend(handles=handles, loc="outside upper left", ncols=3)
         return save_png(figure, path)
 
 
@@ -139,10 +152,11 @@ def trajectory_error(
     errors: Mapping[str, Float[Array | np.ndarray, "..."]],
     path: str | os.PathLike[str],
 ) -> Path:
-    """Relative error over time: median and the half of the trajectories around it; returns the path of the PNG.
+    """Relative error over time, median and interquartile band; returns the PNG's path.
 
-    **Arguments:** `time` (T,) in s; `errors`, by the model's name, (N, T): the relative error of N trajectories. An
-    error that is not finite counts as larger than all others, and the legend says how many trajectories have one.
+    **Arguments:** `time` (T,) in s; `errors`, by the model's name, (N, T): the relative error of N
+    trajectories. An error that is not finite counts as larger than all others, and the legend says
+    how many trajectories have one.
 
     **Raises:** `CaromError` for shapes that do not fit, or a path that cannot be written.
     """
@@ -166,12 +180,11 @@ def trajectory_error(
             axes.set_yscale("log")
             low, high = axes.get_ylim()
             axes.set_ylim(low, min(high, LARGEST_ERROR))
-            axes.legend(loc="lower right")
+            _legend_above(axes)
         else:
             _empty(axes, "no error above zero")
-        axes.set(xlabel="time (s)", ylabel="relative error")
-        if drawn and any(len(values) > 1 for values in curves.values()):
-            axes.set_title("median and interquartile range", color=MUTED, fontsize=8)
+        spread = any(len(values) > 1 for values in curves.values())
+        axes.set(xlabel="time (s)", ylabel=f"relative error{' (median, quartiles)' if spread else ''}")
         return save_png(figure, path)
 
 
@@ -180,10 +193,10 @@ def energy(
     curves: Mapping[str, Float[Array | np.ndarray, "..."]],
     path: str | os.PathLike[str],
 ) -> Path:
-    """Total energy over time; returns the path of the PNG.
+    """Total energy over time; returns the PNG's path.
 
-    **Arguments:** `time` (T,) in s; `curves`, by name, in J: (T,), or (N, T) for median and interquartile band. One
-    called "true" is drawn dashed in black, over the others.
+    **Arguments:** `time` (T,) in s; `curves`, by name, in J: (T,), or (N, T) for median and
+    interquartile band. One called "true" is drawn dashed in black, over the others.
 
     **Raises:** `CaromError` for shapes that do not fit, or a path that cannot be written.
     """
@@ -207,7 +220,7 @@ def energy(
             if len(rows) > 1:
                 _band(axes, seconds, lower, upper, color, finite & np.isfinite(lower + upper))
         if drawn:
-            axes.legend(loc="best")
+            _legend_above(axes)
         else:
             _empty(axes, "no finite energy")
         axes.set(xlabel="time (s)", ylabel="energy (J)")
@@ -252,9 +265,7 @@ def _quantity(rows, truth, key: str, label: str, member: str, color: str) -> _Qu
     learned = np.array([values + [np.nan] * (width - len(values)) for values in lists])
     true = np.array(_list(key, None if truth is None else truth.get(key)))
     if width and true.size not in (0, width):
-        raise CaromError(
-            f"truth[{key!r}] must have {width} values, as many as were learned; it had {true.size}."
-        )
+        raise CaromError(f"truth[{key!r}] must have {width} values, as many as were learned; it had {true.size}.")
     learned = learned.reshape(len(rows), width)
     known = bool(np.isfinite(true).any())
     return _Quantity(label, member, color, learned, true if known else None, key == "mass_ratio")
@@ -268,8 +279,8 @@ def _curves(time, curves, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]
         array = np.asarray(values, dtype=float)
         if seconds.ndim != 1 or array.ndim not in (1, 2) or array.shape[-1] != seconds.size:
             raise CaromError(
-                f"{name}[{key!r}] must have the shape (N, {seconds.size}), one value for each time; it was "
-                f"{array.shape} and time {seconds.shape}."
+                f"{name}[{key!r}] must have the shape (N, {seconds.size}), a value for each time; "
+                f"it was {array.shape}, and time {seconds.shape}."
             )
         checked[key] = np.atleast_2d(array)
     if not checked or any(array.size == 0 for array in checked.values()):
@@ -278,7 +289,7 @@ def _curves(time, curves, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 def _quartiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quartiles over the first axis; values that are not finite count as the largest, and come out as NaN."""
+    """Quartiles over the first axis; what is not finite counts as largest, and comes out as NaN."""
     filled = np.where(np.isfinite(values), values, NOT_FINITE)
     quartiles = np.quantile(filled, [0.25, 0.5, 0.75], axis=0)
     # Halfway to the stand-in is still far beyond anything that was measured.
@@ -290,11 +301,11 @@ def _quartiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _styled(curves: Mapping[str, np.ndarray]):
-    """Colour and dashes for each curve; "true" is dashed ink, and beyond the palette lines are dotted."""
+    """Color and dashes of each curve: dashed ink for "true", dotted lines beyond the palette."""
     others = [name for name in curves if name != "true"]
     for item in curves.items():
         if item[0] == "true":
-            yield INK, (0, (4, 2)), item
+            yield INK, DASHES, item
         else:
             turn, k = divmod(others.index(item[0]), len(PALETTE))
             yield PALETTE[k], ("-", (0, (1, 1.5)), (0, (5, 1.5)))[turn % 3], item
@@ -351,45 +362,36 @@ def _mark_best(axes: Axes, epochs: np.ndarray, validation: np.ndarray) -> None:
         markeredgecolor="white",
         markeredgewidth=1.2,
         zorder=4,
-        label=f"best: {_power(validation[best])}, epoch {epochs[best]:.0f}",
+        label=f"best: {power(float(validation[best]))}, epoch {epochs[best]:.0f}",
     )
 
 
-def _power(value: float) -> str:
-    """`value` with two digits, as one writes it: 1.3 x 10^-4."""
-    digits, exponent = f"{value:.1e}".split("e")
-    return rf"${digits} \times 10^{{{int(exponent)}}}$"
+def _legend_above(axes: Axes) -> None:
+    """Name the curves above the panel, where they do not run."""
+    names = [str(label) for label in axes.get_legend_handles_labels()[1]]
+    columns = 2 if max(map(len, names)) > 20 or len(names) == 4 else 3
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.01), ncols=columns, columnspacing=1.6)
 
 
 def _values_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
     """What was learned as solid lines, the truth as dashed ones."""
     axes.set_ylabel(quantity.label)
-    count = quantity.learned.shape[1]
-    few = count <= MOST_NAMED
+    crowded = _is_crowded(quantity)
     drawn = False
     for k, values in enumerate(quantity.learned.T):
-        style: dict[str, Any] = {"color": _color(quantity, k)}
-        style |= {"label": f"{quantity.member} {k}"} if few else {"linewidth": 0.7, "alpha": 0.6}
-        drawn |= _line(axes, epochs, values, np.isfinite(values), **style)
+        style: dict[str, Any] = {"linewidth": 0.7, "alpha": 0.6} if crowded else {}
+        drawn |= _line(axes, epochs, values, np.isfinite(values), color=_color(quantity, k), **style)
     if not drawn:
         _empty(axes, "none was recorded")
         return
     if quantity.truth is not None:
-        for k in np.unique(quantity.truth[np.isfinite(quantity.truth)], return_index=True)[1]:
-            value = quantity.truth[np.isfinite(quantity.truth)][k]
-            axes.axhline(
-                value,
-                color=INK,
-                alpha=0.75 if few else 0.35,
-                linestyle=(0, (4, 2)),
-                linewidth=1.1 if few else 0.7,
-                zorder=3,
-            )
-    if few and count > 1:
-        handles = [
-            Line2D([], [], color=_color(quantity, k), label=f"{quantity.member} {k}") for k in range(count)
-        ]
-        axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.03), handlelength=1.0)
+        style = {"alpha": 0.35, "linewidth": 0.7} if crowded else {"alpha": 0.8, "linewidth": 1.1}
+        for value in np.unique(quantity.truth[np.isfinite(quantity.truth)]):
+            axes.axhline(value, color=INK, linestyle=DASHES, zorder=3, **style)
+    low, high = axes.get_ylim()
+    if high - low < SMALLEST_SPAN:
+        middle = (low + high) / 2
+        axes.set_ylim(middle - SMALLEST_SPAN / 2, middle + SMALLEST_SPAN / 2)
 
 
 def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
@@ -410,19 +412,28 @@ def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
     mean = np.where(known, error, 0).sum(axis=1) / np.where(known.any(axis=1), known.sum(axis=1), np.nan)
     positive = error[known & (error > 0)]
     floor = 10 ** (np.floor(np.log10(positive.min())) - 0.5) if positive.size else 1e-10
-    many = quantity.learned.shape[1] > MOST_NAMED
+    crowded = _is_crowded(quantity)
     for k, values in enumerate(error.T):
         style: dict[str, Any] = {"color": _color(quantity, k + quantity.relative)}
-        style |= {"linewidth": 0.7, "alpha": 0.4} if many else {"linewidth": 1.2}
+        style |= {"linewidth": 0.7, "alpha": 0.4} if crowded else {"linewidth": 1.2}
         _line(axes, epochs, np.maximum(values, floor), np.isfinite(values), clip_on=False, **style)
-    if error.shape[1] > 1:
-        _line(axes, epochs, np.maximum(mean, floor), np.isfinite(mean), color=INK, linewidth=2.2)
+    if crowded:
+        _line(axes, epochs, np.maximum(mean, floor), np.isfinite(mean), color=INK, linewidth=2)
     _log_axis(axes)
     if (error[known] == 0).any():
         _show_zero(axes, floor)
     last = mean[np.isfinite(mean)][-1]
-    text = _power(last) if last > 0 else "0"
-    axes.set_title(f"final {kind}: {text}", fontsize=8, color=MUTED, loc="right")
+    which = "final mean" if error.shape[1] > 1 else "final"
+    text = f"{which}: {power(float(last))}"
+    axes.set_title(text, fontsize=8, color=MUTED, loc="right")
+
+
+def _name_lines(axes: Axes, quantity: _Quantity) -> None:
+    """Say beside the row which color is which, where there are a few."""
+    count = quantity.learned.shape[1]
+    if 1 < count <= MOST_NAMED:
+        handles = [Line2D([], [], color=_color(quantity, k), label=f"{quantity.member} {k}") for k in range(count)]
+        axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.03), handlelength=1.2)
 
 
 def _show_zero(axes: Axes, floor: float) -> None:
@@ -437,6 +448,10 @@ def _show_zero(axes: Axes, floor: float) -> None:
 
 
 def _color(quantity: _Quantity, k: int) -> str:
-    """One colour for one or for many values, a colour each for a few."""
+    """One color for one or for many values, a color each for a few."""
     count = quantity.learned.shape[1]
     return PALETTE[k] if 1 < count <= MOST_NAMED else quantity.color
+
+
+def _is_crowded(quantity: _Quantity) -> bool:
+    return quantity.learned.shape[1] > MOST_NAMED

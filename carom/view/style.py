@@ -1,4 +1,4 @@
-"""How carom's figures look, and how they are written: one style, kept apart from matplotlib's global state.
+"""How carom's figures look and how they are written, apart from matplotlib's global state.
 
 Figures are `matplotlib.figure.Figure` objects drawn by Agg; pyplot is never imported.
 """
@@ -19,9 +19,10 @@ from carom.errors import CaromError
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
-"""Okabe and Ito's colours, which people with any kind of colour blindness can tell apart.
+"""Okabe and Ito's colors, which people with any kind of color blindness can tell apart.
 
-Without their yellow, which is too faint for lines on white, and their black, which is for the truth and for text.
+Without their yellow, which is too faint for lines on white, and their black, which is for the truth
+and for text.
 """
 INK, MUTED, FAINT, SOLID = "#20242B", "#69707B", "#E4E7EB", "#F3F4F6"
 """Text and truth; less important text; grid; the solid side of walls."""
@@ -78,7 +79,7 @@ _STYLE = {
 
 @contextlib.contextmanager
 def figure_style() -> Iterator[None]:
-    """carom's style inside the block, on top of matplotlib's defaults; what was set before is back after it."""
+    """carom's style, on top of matplotlib's defaults; after the block all is as it was before."""
     with matplotlib.style.context(["default", _STYLE]):
         yield
 
@@ -93,7 +94,8 @@ def new_figure(width: float, height: float, *, dpi: float = DPI, constrained: bo
 def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write `figure` at its own dpi and return the path. Nothing half-written is ever seen there.
 
-    **Raises:** `CaromError` for a path that does not end in .png, a missing folder, or one that cannot be written to.
+    **Raises:** `CaromError` for a path that does not end in .png, a missing folder, or one that
+    cannot be written to.
     """
     path = checked_path(path, (".png",))
     with replacing(path) as temporary:
@@ -102,7 +104,7 @@ def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def checked_path(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
-    """`path`, if it ends in one of `suffixes` and its folder exists; else a `CaromError` that says what is wrong."""
+    """`path`, if it ends in one of `suffixes` and its folder exists; else raises `CaromError`."""
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise CaromError(f"path must end in {' or '.join(suffixes)}; it was {str(path)!r}.")
@@ -122,7 +124,7 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         raise CaromError(
-            f"path {str(path)!r} cannot be written: {error.strerror or error}. Choose another, or free the place."
+            f"path {str(path)!r} cannot be written: {error.strerror or error}. Choose another path."
         ) from error
     finally:
         with contextlib.suppress(OSError):
@@ -132,3 +134,11 @@ def replacing(path: Path) -> Iterator[Path]:
 def note(axes: Axes, text: str) -> None:
     """Say in the middle of an empty panel why it is empty."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=MUTED)
+
+
+def power(value: float) -> str:
+    """`value` with two digits, as one writes it: 1.3 x 10^-4."""
+    if value == 0:
+        return "0"
+    digits, exponent = f"{value:.1e}".split("e")
+    return rf"${digits} \times 10^{{{int(exponent)}}}$"

@@ -1,0 +1,11 @@
+"""Types of command-line arguments, with the names that help texts show."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+TaskName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+FolderPath = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]

@@ -1,0 +1,48 @@
+"""`carom evaluate RUN`: measure a learned model on test data."""
+
+import dataclasses
+
+from rich.console import Console
+
+from carom.cli.arguments import FilePath, RunPath
+from carom.cli.learn import TEST_DATA, pictures
+from carom.cli.tables import evaluation_table, property_table
+from carom.learning.dataset import count_touches
+from carom.learning.evaluate import evaluate
+from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.run import CONFIG, MODEL, RunFolder
+from carom.simulation.files import load_recording
+from carom.tasks import task
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Measure a learned model: contact properties, mass ratios, trajectory error, energy, constraints.
+
+    Writes evaluation.json and pictures into the run folder.
+    """
+
+    run_folder: RunPath
+    """Run folder that `carom learn` has made."""
+    data: FilePath = None
+    """Trajectory file to test on; by default the run's own test data."""
+
+    def after_interrupt(self) -> str:
+        """What to say when interrupted."""
+        return "Nothing was changed."
+
+    def run(self) -> None:
+        """Do it."""
+        run = RunFolder.open(self.run_folder)
+        name = run.read_json(CONFIG)["task"]
+        truth = task(name)
+        header = read_model_header(run.path / MODEL)
+        system = load_model_into(run.path / MODEL, truth)
+        test = load_recording(self.data or run.path / TEST_DATA, task=name)
+        measures, predicted = evaluate(system, test, truth=truth, formulation=header["formulation"])
+        run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
+        pictures(run, system, test, predicted)
+        console = Console()
+        console.print(property_table(system, truth, count_touches(test, truth)))
+        console.print(evaluation_table(measures))
+        console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

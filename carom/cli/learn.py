@@ -1,0 +1,209 @@
+"""`carom learn TASK`: make or read data, train, and write a run folder with tables and pictures."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+import carom
+from carom.checks import require
+from carom.cli.arguments import FilePath, FolderPath, TaskName
+from carom.cli.tables import evaluation_table, property_table
+from carom.learning.dataset import Dataset, count_touches, trajectory_of
+from carom.learning.evaluate import evaluate, state_errors
+from carom.learning.model_file import save_model
+from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
+from carom.learning.train import FORMULATIONS, LearnConfig, LearnReport, learn, quantities
+from carom.simulation.files import Recording, load_recording, save_recording
+from carom.simulation.rollout import Trajectory
+from carom.system import System
+from carom.tasks import make_recording, task
+
+TEST_DATA = "test.h5"
+QUICK = {"trajectories": 100, "epochs": 20}
+"""What `--quick` makes smaller, where it is not set by hand."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Learn:
+    """Learn masses, potential, friction and restitution of a task, from simulated or recorded trajectories.
+
+    Writes a run folder: configuration, metrics, checkpoints, the learned model, a report, and pictures.
+    """
+
+    task: TaskName
+    """Name of the task: its geometry is known, all else is learned."""
+    data: FilePath = None
+    """Trajectory file (.h5, .hdf5 or .npz) to learn from; without it, data are simulated."""
+    val: FilePath = None
+    """Trajectory file to validate on; without it, a tenth of the data."""
+    test: FilePath = None
+    """Trajectory file to test on; without it, a tenth of the data."""
+    out: FolderPath = None
+    """Run folder; by default runs/TASK-MODEL, with a number if that is taken."""
+    resume: bool = False
+    """Go on with the training in the folder --out from its last checkpoint."""
+    trajectories: int = 800
+    """Training trajectories to simulate (and an eighth as many each to validate and to test)."""
+    quick: bool = False
+    """A small training of well under a minute, to try things out: few trajectories and epochs."""
+    config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
+
+    def after_interrupt(self) -> str:
+        """What to say when interrupted."""
+        return "The last checkpoint is kept: go on with --out FOLDER --resume." if self.out else ""
+
+    def run(self) -> None:
+        """Do it."""
+        command = self._quickened() if self.quick else self
+        command._run(Console())
+
+    def _quickened(self) -> "Learn":
+        trajectories = QUICK["trajectories"] if self.trajectories == Learn.trajectories else self.trajectories
+        epochs = QUICK["epochs"] if self.config.epochs == LearnConfig.epochs else self.config.epochs
+        return dataclasses.replace(
+            self, trajectories=trajectories, config=dataclasses.replace(self.config, epochs=epochs)
+        )
+
+    def _run(self, console: Console) -> None:
+        truth = task(self.task)
+        require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
+        folder = self._folder()
+        if not self.resume:
+            dataset, test = self._data(truth, console)
+            run = RunFolder.create(folder, self._description())
+            save_recording(run.path / TEST_DATA, test)
+            run.write_json(TRUTH, quantities(truth))
+        else:
+            run = RunFolder.open(folder)
+            self._check_same(run)
+            dataset, test = self._data(truth, console)
+        console.print(
+            f"Learning {self.task} with {self.config.model.upper()} from {dataset.train.n_trajectories} trajectories of "
+            f"{int(dataset.train.length.max())} states into {run.path}",
+            soft_wrap=True,
+            highlight=False,
+        )
+        try:
+            system, report = learn(truth, dataset, self.config, run=run)
+        finally:
+            run.close()
+        self._finish(console, run, system, report, truth, dataset, test)
+
+    def _folder(self) -> Path:
+        if self.out is not None:
+            return self.out
+        require(not self.resume, "resume needs --out: the folder of the run to go on with.")
+        base = Path("runs") / f"{self.task}-{self.config.model}"
+        number = 1
+        while (path := base if number == 1 else base.with_name(f"{base.name}-{number}")).exists():
+            number += 1
+        return path
+
+    def _description(self) -> dict[str, Any]:
+        return {
+            "task": self.task,
+            "data": str(self.data) if self.data else None,
+            "val": str(self.val) if self.val else None,
+            "test": str(self.test) if self.test else None,
+            "trajectories": self.trajectories,
+            **dataclasses.asdict(self.config),
+            "carom_version": carom.__version__,
+            "jax_version": jax.__version__,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        }
+
+    def _check_same(self, run: RunFolder) -> None:
+        """Raise if a run would go on with other settings than it was started with."""
+        before = run.read_json(CONFIG)
+        now = self._description()
+        free = {"carom_version", "jax_version", "started"}
+        for name in now:
+            new = list(now[name]) if isinstance(now[name], tuple) else now[name]
+            require(
+                name in free or before.get(name) == new,
+                f"the run in {run.path} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same options to "
+                "go on with it, or another --out.",
+            )
+
+    def _data(self, truth: System, console: Console) -> tuple[Dataset, Recording]:
+        """Training, validation and test data: read, or simulated from seeds of their own."""
+        if self.data is None:
+            for name in ("val", "test"):
+                require(getattr(self, name) is None, f"{name} needs --data: give the file to train on too.")
+            console.print(f"Simulating {self.task} ...", highlight=False)
+            held = max(self.trajectories // 8, 2)
+            counts = {"train": self.trajectories, "val": held, "test": held}
+            parts = {
+                name: make_recording(truth, jax.random.fold_in(jax.random.key(self.config.seed), k), count)
+                for k, (name, count) in enumerate(counts.items())
+            }
+            return Dataset(parts["train"], parts["val"]), parts["test"]
+        data = load_recording(self.data, task=self.task)
+        test = load_recording(self.test, task=self.task) if self.test else None
+        if test is None:
+            data, test = _hold_out(data, self.config.seed)
+        if self.val is not None:
+            return Dataset(data, load_recording(self.val, task=self.task)), test
+        return Dataset.split(data, val=1 / 9, seed=self.config.seed), test
+
+    def _finish(self, console, run, system, report: LearnReport, truth, dataset, test) -> None:
+        formulation = FORMULATIONS[self.config.model]
+        save_model(run.path / MODEL, system, formulation=formulation)
+        measures, predicted = evaluate(system, test, truth=truth, formulation=formulation)
+        touches = count_touches(dataset.train, truth)
+        run.write_json(
+            REPORT,
+            {"learned": dataclasses.asdict(report), "evaluation": measures, "touches": touches.tolist()},
+        )
+        console.print(property_table(system, truth, touches))
+        console.print(evaluation_table(measures))
+        if report.skipped_steps or report.overflowed_contacts:
+            console.print(
+                f"Note: {report.skipped_steps} steps were left out because a gradient was not finite; "
+                f"{report.overflowed_contacts} predicted contacts found no place in the solver.",
+                highlight=False,
+            )
+        pictures(run, system, test, predicted)
+        seconds = f"{report.seconds:.0f} s for {report.epochs} epochs" + (
+            ", stopped early" if report.stopped_early else ""
+        )
+        console.print(f"Done ({seconds}). Everything is in {run.path}", soft_wrap=True, highlight=False)
+
+
+def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
+    """Keep a tenth of the trajectories for the test."""
+    n = data.n_trajectories
+    require(n >= 3, f"data must hold at least 3 trajectories, to train, validate and test; it held {n}.")
+    order = np.random.default_rng((seed, 2)).permutation(n)
+    count = max(1, round(n / 10))
+    return data.select(np.sort(order[count:])), data.select(np.sort(order[:count]))
+
+
+def pictures(run: RunFolder, system: System, test: Recording, predicted: Trajectory) -> None:
+    """Draw learning curves, contact properties, error over time, and the animation of one test trajectory."""
+    from carom.view import animate, figures  # matplotlib is slow to import
+
+    metrics = run.metrics()
+    if metrics:
+        figures.learning_curves(metrics, run.path / "learning_curves.png")
+        figures.contact_properties(metrics, run.read_json(TRUTH), run.path / "contact_properties.png")
+    relative, _ = state_errors(test, predicted)
+    figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")
+    k = most_eventful(test)
+    shown = trajectory_of(test, k)
+    animate.animate(system, shown, one_of(predicted, k, len(shown.time)), run.path / "prediction.gif")
+
+
+def one_of(batch: Trajectory, k: int, length: int) -> Trajectory:
+    """Trajectory number `k` of a batch, up to `length`."""
+    return jax.tree.map(lambda a: a[:length] if a is batch.time else a[k, :length], batch)
+
+
+def most_eventful(test: Recording) -> int:
+    """The test trajectory with the most contact, the first of equals."""
+    return 0 if test.contact is None else int(np.argmax(test.contact.sum(axis=1)))

@@ -1,0 +1,58 @@
+"""Entry point of the command `carom`: subcommands, errors in one line, exit codes."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from carom.cli.evaluate import Evaluate
+from carom.cli.learn import Learn
+from carom.cli.simulate import Simulate
+from carom.errors import CaromError
+
+Command = (
+    Annotated[Learn, tyro.conf.subcommand("learn")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; exit code 2 for bad input, 130 when interrupted."""
+    command = tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        prog="carom",
+        description="Learn mechanical systems with contact from trajectories, and simulate them.",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    configure_jax()
+    try:
+        command.run()
+    except CaromError as error:
+        print(f"carom: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print(f"carom: interrupted. {command.after_interrupt()}".rstrip(), file=sys.stderr)
+        sys.exit(130)
+
+
+def configure_jax() -> None:
+    """Double precision, and a cache of compiled programs between runs (CAROM_CACHE names its folder, empty: none)."""
+    import logging
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "carom"
+    folder = os.environ.get("CAROM_CACHE", str(default))
+    if folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""`carom simulate TASK`: make a trajectory file with the true or a learned system."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+from carom.checks import require
+from carom.cli.arguments import FilePath, FolderPath, TaskName
+from carom.learning.dataset import recording_of
+from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.run import MODEL, RunFolder
+from carom.simulation.files import load_recording, save_recording
+from carom.simulation.rollout import COMPENSATION_STEPS, simulate
+from carom.tasks import find_task, sample
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """Simulate a task and write its trajectories to a file."""
+
+    task: TaskName
+    """Name of the task."""
+    out: FilePath = None
+    """File to write (.h5, .hdf5 or .npz); by default TASK.h5."""
+    run_folder: FolderPath = None
+    """Use the model learned in this run folder in place of the true system."""
+    initial: FilePath = None
+    """Start from the first states of the trajectories in this file; by default from the task's own distribution."""
+    trajectories: int = 10
+    """How many."""
+    steps: int | None = None
+    """Time steps of each; by default the task's."""
+    dt: float | None = None
+    """Time step in seconds; by default the task's."""
+    seed: int = 0
+    """Seed of the initial states."""
+    project: bool = True
+    """Bring each step's end back onto the constraints."""
+    compensation_steps: float = COMPENSATION_STEPS
+    """Time steps over which a penetration is undone."""
+
+    def after_interrupt(self) -> str:
+        """What to say when interrupted."""
+        return "No file was written."
+
+    def run(self) -> None:
+        """Do it."""
+        chosen = find_task(self.task)
+        system, formulation, source = chosen.system(), "lagrangian", "carom simulate"
+        if self.run_folder is not None:
+            model = RunFolder.open(self.run_folder).path / MODEL
+            header = read_model_header(model)
+            require(
+                header["task"] == self.task,
+                f"run-folder {self.run_folder} holds a model of task {header['task']!r}, not {self.task!r}.",
+            )
+            system, formulation = load_model_into(model, system), header["formulation"]
+            source = f"carom simulate, model {model}"
+        require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
+        out = Path(f"{self.task}.h5") if self.out is None else self.out
+        if self.initial is not None:
+            first = load_recording(self.initial, task=self.task)
+            x0, v0 = jnp.asarray(first.x[:, 0]), jnp.asarray(first.v[:, 0])
+        else:
+            x0, v0 = sample(system, jax.random.key(self.seed), self.trajectories)
+        trajectory = simulate(
+            system,
+            x0,
+            v0,
+            dt=chosen.dt if self.dt is None else self.dt,
+            steps=chosen.steps if self.steps is None else self.steps,
+            project=self.project,
+            formulation=formulation,
+            compensation_steps=self.compensation_steps,
+        )
+        save_recording(out, recording_of(trajectory, task=self.task, source=source))
+        n, steps = trajectory.x.shape[:2]
+        Console().print(
+            f"{n} trajectories of {steps} states, {float(trajectory.contact.mean()):.0%} of them after a contact, in {out}",
+            soft_wrap=True,
+            highlight=False,
+        )

@@ -1,0 +1,110 @@
+"""How good a learned system is: contact properties, mass ratios, trajectory error, energy and constraints."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from carom.checks import require
+from carom.learning.models import mass_ratios
+from carom.mechanics.dynamics import Formulation
+from carom.simulation.files import Recording
+from carom.simulation.rollout import Trajectory, simulate
+from carom.system import System
+
+
+def predict(
+    system: System, recording: Recording, *, formulation: Formulation = "lagrangian", project: bool = True
+) -> Trajectory:
+    """Motion of `system` from the first recorded state of each trajectory, as long as the recording.
+
+    A prediction that goes wrong is not an error here: it is a bad prediction, and measured as such.
+    """
+    return simulate(
+        system,
+        jnp.asarray(recording.x[:, 0]),
+        jnp.asarray(recording.v[:, 0]),
+        dt=recording.dt,
+        steps=recording.x.shape[1] - 1,
+        formulation=formulation,
+        project=project,
+        throw=False,
+    )
+
+
+def state_errors(
+    recording: Recording, predicted: Trajectory
+) -> tuple[Float[np.ndarray, "N T"], Float[np.ndarray, "N T"]]:
+    """Relative errors of each predicted state: `|z - z^| / |z|`, and bounded `|z - z^| / sqrt(|z|^2 + |z^|^2)`.
+
+    `z` holds positions and velocities together (m and m/s, as the paper); NaN after a trajectory's own end.
+    """
+
+    def flat(x, v):
+        return np.concatenate([np.asarray(a).reshape(*np.shape(a)[:2], -1) for a in (x, v)], axis=-1)
+
+    true, guess = flat(recording.x, recording.v), flat(predicted.x, predicted.v)
+    valid = np.arange(true.shape[1]) < recording.length[:, None]
+    true = np.where(valid[..., None], true, np.nan)
+    distance = np.linalg.norm(true - guess, axis=-1)
+    size = np.linalg.norm(true, axis=-1)
+    bounded = distance / np.sqrt(size**2 + np.linalg.norm(guess, axis=-1) ** 2)
+    lost = valid & ~np.isfinite(guess).all(axis=-1)
+    return np.where(lost, np.inf, distance / size), np.where(lost, 1.0, bounded)
+
+
+def evaluate(
+    system: System,
+    recording: Recording,
+    *,
+    truth: System | None = None,
+    formulation: Formulation = "lagrangian",
+) -> tuple[dict[str, Any], Trajectory]:
+    """Measures of `system` on test recordings, and its predictions.
+
+    **Arguments:** `system`, learned; `recording`, test data; `truth`, the true system where it is known, for the errors of
+    properties and the drift of the true energy.
+
+    **Returns:** a dictionary of numbers (definitions: the paper, section 5 and appendix L; the first of each pair below
+    is the paper's) with
+
+    - `trajectory_error`: mean over time, then over trajectories, of the relative error, with `_ci95`, half of the 95 %
+      interval of that mean; `_median` over trajectories; `_geometric`, geometric mean over time, mean over trajectories;
+      `bounded_error`: mean of the bounded form.
+    - `energy_drift`: largest `|E - E_0| / max |E|` along predictions of a system that keeps energy, by the true system.
+    - `constraint_error`: largest `|Phi|` (m^2).
+    - `friction_error`, `restitution_error` (absolute, by property) and `mass_ratio_error` (relative, by body).
+
+    **Raises:** `CaromError` if the recording is of another system.
+    """
+    shape = (system.n_points, system.dim)
+    require(
+        recording.x.shape[2:] == shape,
+        f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {shape[0]} in {shape[1]}D. Is it "
+        "a file of another task?",
+    )
+    predicted = predict(system, recording, formulation=formulation)
+    relative, bounded = state_errors(recording, predicted)
+    later, later_bounded = relative[:, 1:], bounded[:, 1:]
+    per_trajectory = np.nanmean(later, axis=1)
+    count = len(per_trajectory)
+    out: dict[str, Any] = {
+        "trajectories": count,
+        "steps": int(recording.length.max()) - 1,
+        "trajectory_error": float(np.mean(per_trajectory)),
+        "trajectory_error_ci95": float(1.96 * np.std(per_trajectory, ddof=1) / np.sqrt(count)) if count > 1 else None,
+        "trajectory_error_median": float(np.median(per_trajectory)),
+        "trajectory_error_geometric": float(np.mean(np.exp(np.nanmean(np.log(np.maximum(later, 1e-16)), axis=1)))),
+        "bounded_error": float(np.mean(np.nanmean(later_bounded, axis=1))),
+        "constraint_error": float(np.max(np.abs(np.asarray(system.constraints(predicted.x))), initial=0.0)),
+        "overflowed_contacts": int(np.sum(predicted.overflow)),
+    }
+    if truth is not None:
+        out["friction_error"] = np.abs(np.asarray(system.friction - truth.friction)).tolist()
+        out["restitution_error"] = np.abs(np.asarray(system.restitution - truth.restitution)).tolist()
+        out["mass_ratio_error"] = np.abs(mass_ratios(system) / mass_ratios(truth) - 1).tolist()
+        if np.all(np.asarray(truth.restitution) == 1) and np.all(np.asarray(truth.friction) == 0):
+            energy = np.asarray(truth.energy(predicted.x, predicted.v))
+            out["energy_drift"] = float(np.max(np.abs(energy - energy[:, :1])) / np.max(np.abs(energy)))
+    return out, predicted

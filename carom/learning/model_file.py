@@ -1,0 +1,103 @@
+"""Learned models as one file: a line of JSON that describes it, then the arrays. Loading it never runs code."""
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from carom.checks import require
+from carom.errors import CaromError
+from carom.learning.models import NeuralPotential
+from carom.learning.run import write_atomically
+from carom.system import System
+
+MAGIC = b"carom model 1\n"
+
+
+def save_model(path: str | Path, system: System, *, formulation: str = "lagrangian") -> None:
+    """Save a learned system. To load it again, its skeleton is needed (a task's is found by its name).
+
+    **Raises:** `CaromError` if the file cannot be written.
+    """
+    body = io.BytesIO()
+    eqx.tree_serialise_leaves(body, system)
+    payload = body.getvalue()
+    header: dict[str, Any] = {
+        "task": system.name,
+        "formulation": formulation,
+        "points": system.n_points,
+        "dim": system.dim,
+        "network": None,
+        "sha256": hashlib.sha256(payload).hexdigest(),
+    }
+    if isinstance(system.potential, NeuralPotential):
+        network = system.potential.network
+        header["network"] = {
+            "width": network.width_size,
+            "depth": network.depth,
+            "dtype": str(network.layers[0].weight.dtype),
+        }
+    write_atomically(Path(path), MAGIC + json.dumps(header).encode() + b"\n" + payload)
+
+
+def read_model_header(path: str | Path) -> dict[str, Any]:
+    """What a model file says of itself: task, formulation, sizes."""
+    return _read(Path(path))[0]
+
+
+def load_model_into(path: str | Path, skeleton: System) -> System:
+    """The learned system of a file, with the structure of `skeleton`.
+
+    **Raises:** `CaromError` if the file cannot be read, is damaged, or belongs to another system.
+    """
+    header, payload = _read(Path(path))
+    shape = (header["points"], header["dim"])
+    require(
+        shape == (skeleton.n_points, skeleton.dim),
+        f"the model {path} is of a system with {shape[0]} points in {shape[1]}D; the skeleton has {skeleton.n_points} in "
+        f"{skeleton.dim}D. Give the skeleton it was learned with.",
+    )
+    if header["network"] is not None:
+        potential = NeuralPotential(
+            skeleton.n_points,
+            skeleton.dim,
+            width=header["network"]["width"],
+            depth=header["network"]["depth"],
+            dtype=jnp.dtype(header["network"]["dtype"]),
+            key=jax.random.key(0),
+        )
+        skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)
+    try:
+        return eqx.tree_deserialise_leaves(io.BytesIO(payload), skeleton)
+    except (RuntimeError, ValueError, EOFError, TypeError) as error:
+        raise CaromError(
+            f"the model {path} does not fit the skeleton ({str(error).splitlines()[0]}). Give the skeleton it was learned with, "
+            "in the same precision."
+        ) from error
+
+
+def _read(path: Path) -> tuple[dict[str, Any], bytes]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CaromError(f"cannot read the model {path}: {error.strerror}.") from error
+    require(
+        data.startswith(MAGIC), f"{path} is not a carom model. Give a model.carom file that `carom learn` has made."
+    )
+    line, _, payload = data[len(MAGIC) :].partition(b"\n")
+    try:
+        header = json.loads(line)
+    except ValueError as error:
+        raise CaromError(
+            f"the model {path} is damaged: its header cannot be read. Use a copy, or learn again."
+        ) from error
+    require(
+        hashlib.sha256(payload).hexdigest() == header.get("sha256"),
+        f"the model {path} is damaged: its checksum does not match. Use a copy, or learn again.",
+    )
+    return header, payload

@@ -1,0 +1,192 @@
+"""The run folder of a training: configuration, metrics, checkpoints and results, each whole or absent."""
+
+import json
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from carom.checks import require
+from carom.errors import CaromError
+
+CONFIG, TRUTH, METRICS, REPORT, MODEL = (
+    "config.json",
+    "truth.json",
+    "metrics.jsonl",
+    "report.json",
+    "model.carom",
+)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that it is there whole, or as it was before.
+
+    **Raises:** `CaromError` if the folder is missing or not writable.
+    """
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise CaromError(
+            f"cannot write {path}: {error.strerror}. Choose a folder that exists and that you may write to."
+        ) from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+class RunFolder:
+    """A folder with `config.json`, `metrics.jsonl`, `checkpoints/`, `model.carom`, `report.json` and figures."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self._manager: Any = None
+
+    @classmethod
+    def create(cls, path: str | os.PathLike, config: dict[str, Any]) -> "RunFolder":
+        """A new folder with its configuration.
+
+        **Raises:** `CaromError` if it already holds a run, or cannot be written.
+        """
+        run = cls(path)
+        require(
+            not (run.path / CONFIG).exists(),
+            f"the folder {run.path} already holds a run. Choose another with --out, or go on with it with --resume.",
+        )
+        try:
+            run.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CaromError(
+                f"cannot make the run folder {run.path}: {error.strerror}. Choose another with --out."
+            ) from error
+        run.write_json(CONFIG, config)
+        return run
+
+    @classmethod
+    def open(cls, path: str | os.PathLike) -> "RunFolder":
+        """An existing run.
+
+        **Raises:** `CaromError` if there is none.
+        """
+        run = cls(path)
+        require(
+            (run.path / CONFIG).is_file(),
+            f"{run.path} is not a run folder: it has no {CONFIG}. Give a folder that `carom learn` has made.",
+        )
+        return run
+
+    def read_json(self, name: str) -> Any:
+        """The content of a JSON file of the run."""
+        path = self.path / name
+        try:
+            return json.loads(path.read_text())
+        except OSError as error:
+            raise CaromError(f"cannot read {path}: {error.strerror}. Was the run finished?") from error
+        except ValueError as error:
+            raise CaromError(f"{path} is not valid JSON ({error}). Restore the file, or run again.") from error
+
+    def write_json(self, name: str, content: Any) -> None:
+        """Write a JSON file of the run."""
+        write_atomically(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+
+    # --- metrics ---------------------------------------------------------------------------------------------
+
+    def log(self, metrics: dict[str, Any]) -> None:
+        """Append one line to `metrics.jsonl`; numbers that are not finite are written as null."""
+        with (self.path / METRICS).open("a") as file:
+            file.write(json.dumps(_finite(metrics)) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """All lines of `metrics.jsonl`; a last line cut off by a kill is left out."""
+        path = self.path / METRICS
+        if not path.exists():
+            return []
+        lines = path.read_text().splitlines()
+        out = []
+        for number, line in enumerate(lines):
+            try:
+                out.append(json.loads(line))
+            except ValueError as error:
+                if number == len(lines) - 1:
+                    break
+                raise CaromError(f"line {number + 1} of {path} is not valid JSON: remove or restore it.") from error
+        return out
+
+    def rewind_metrics(self, epoch: int) -> None:
+        """Drop the lines after `epoch`: they will be made again."""
+        kept = [m for m in self.metrics() if m["epoch"] <= epoch]
+        write_atomically(self.path / METRICS, "".join(json.dumps(m) + "\n" for m in kept).encode())
+
+    # --- checkpoints -----------------------------------------------------------------------------------------
+
+    @property
+    def _checkpoints(self):
+        if self._manager is None:
+            import orbax.checkpoint as ocp  # slow to import, and only a training needs it
+
+            options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
+            self._manager = ocp.CheckpointManager((self.path / "checkpoints").absolute(), options=options)
+        return self._manager
+
+    def save_checkpoint(self, epoch: int, state: Any) -> None:
+        """Save the arrays of `state`. A kill at any time leaves the one before."""
+        import orbax.checkpoint as ocp
+
+        self._checkpoints.save(epoch, args=ocp.args.StandardSave(_leaves(state)))
+
+    def restore_checkpoint(self, like: Any) -> Any:
+        """The latest checkpoint in the form of `like`, or `None` if there is none.
+
+        **Raises:** `CaromError` if it does not fit, or cannot be read.
+        """
+        import orbax.checkpoint as ocp
+
+        epoch = self._checkpoints.latest_step()
+        if epoch is None:
+            return None
+        leaves = _leaves(like)
+        try:
+            restored = self._checkpoints.restore(epoch, args=ocp.args.StandardRestore(leaves))
+        except Exception as error:  # orbax raises many types for a damaged or foreign checkpoint
+            raise CaromError(
+                f"the checkpoint of epoch {epoch} in {self.path} cannot be restored "
+                f"({str(error).splitlines()[0] if str(error) else type(error).__name__}). Delete the folder "
+                f"{self.path / 'checkpoints' / str(epoch)} to go on from an earlier one, or start a new run."
+            ) from error
+        arrays, rest = eqx.partition(like, eqx.is_array)
+        flat, structure = jax.tree.flatten(arrays)
+        values = [restored[f"{k:04d}"] for k in range(len(flat))]
+        return eqx.combine(jax.tree.unflatten(structure, values), rest)
+
+    def close(self) -> None:
+        """Finish what is being written."""
+        if self._manager is not None:
+            self._manager.close()
+            self._manager = None
+
+
+def _leaves(tree: Any) -> dict[str, jax.Array]:
+    return {f"{k:04d}": leaf for k, leaf in enumerate(jax.tree.leaves(eqx.filter(tree, eqx.is_array)))}
+
+
+def _finite(value: Any) -> Any:
+    """`value` for JSON, with None for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, str) or value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, Iterable):
+        return [_finite(v) for v in value]
+    number = value.item() if isinstance(value, np.generic | np.ndarray | jax.Array) else value
+    return number if np.isfinite(number) else None
