@@ -3,13 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from carom.errors import CaromError
 
 
 def is_known(*values) -> bool:
     """Whether no value is being traced, so that it can be looked at."""
-    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
+    return not any(isinstance(x, Tracer) for v in values for x in jax.tree.leaves(v))
 
 
 def as_floats(value) -> jax.Array:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
@@ -31,8 +31,8 @@ class System(eqx.Module):
     - `constraints`: `Distance`, `Tether`, `Joint` objects between points; a rigid body's own are added.
     - `contacts`: `DiskDisk`, `DiskPlane` objects.
     - `potential`: a `Potential`, such as `Gravity((0., -9.81))`; none by default.
-    - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers to
-      them by its `property` index; a single number is shared by all.
+    - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers
+      to them by its `property` index; a single number is shared by all.
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
       candidates, or twice as many as points where that is less: more are an error, never dropped.
     - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
@@ -59,8 +59,8 @@ class System(eqx.Module):
         constraints: Sequence[Constraint] = (),
         contacts: Sequence[Contact] = (),
         potential: Potential | None = None,
-        friction=0.0,
-        restitution=0.0,
+        friction: ArrayLike = 0.0,
+        restitution: ArrayLike = 0.0,
         *,
         max_active: int | None = None,
         dim: int | None = None,

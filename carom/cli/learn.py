@@ -30,7 +30,7 @@ QUICK = {"trajectories": 100, "epochs": 20}
 
 @dataclasses.dataclass(frozen=True)
 class Learn:
-    """Learn masses, potential, friction and restitution of a task, from simulated or recorded trajectories.
+    """Learn masses, potential, friction and restitution of a task from trajectories.
 
     Writes a run folder: configuration, metrics, checkpoints, the learned model, a report, and pictures.
     """
@@ -83,7 +83,7 @@ class Learn:
             self._check_same(run)
             dataset, test = self._data(truth, console)
         console.print(
-            f"Learning {self.task} with {self.config.model.upper()} from {dataset.train.n_trajectories} trajectories of "
+            f"Learning {self.task} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
             f"{int(dataset.train.length.max())} states into {run.path}",
             soft_wrap=True,
             highlight=False,
@@ -126,8 +126,8 @@ class Learn:
             new = list(now[name]) if isinstance(now[name], tuple) else now[name]
             require(
                 name in free or before.get(name) == new,
-                f"the run in {run.path} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same options to "
-                "go on with it, or another --out.",
+                f"the run in {run.path} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same "
+                "options to go on with it, or another --out.",
             )
 
     def _data(self, truth: System, console: Console) -> tuple[Dataset, Recording]:

@@ -1,9 +1,14 @@
 """Entry point of the command `carom`: subcommands, errors in one line, exit codes."""
 
+import hashlib
+import logging
 import os
 import sys
 from pathlib import Path
 from typing import Annotated
+
+# XLA's loader of cached programs logs pages about processor features; set this to 0 to see all it says.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import tyro
 
@@ -40,18 +45,29 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def configure_jax() -> None:
-    """Double precision, and a cache of compiled programs between runs (CAROM_CACHE names its folder, empty: none)."""
-    import logging
+    """Double precision, and a cache of compiled programs between runs.
 
+    The environment variable CAROM_CACHE names the cache's folder; if it is empty, there is none.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
     logging.getLogger("absl").setLevel(logging.ERROR)
     default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "carom"
-    folder = os.environ.get("CAROM_CACHE", str(default))
-    if folder:
-        jax.config.update("jax_compilation_cache_dir", folder)
+    folder, processor = os.environ.get("CAROM_CACHE", str(default)), _processor()
+    if folder and processor:
+        jax.config.update("jax_compilation_cache_dir", str(Path(folder) / processor))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def _processor() -> str:
+    """A name for this kind of processor: programs compiled on one must not run on another. Empty if unknown."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(flags.encode()).hexdigest()[:16] if flags else ""
 
 
 if __name__ == "__main__":

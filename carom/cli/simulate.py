@@ -77,9 +77,7 @@ class Simulate:
             compensation_steps=self.compensation_steps,
         )
         save_recording(out, recording_of(trajectory, task=self.task, source=source))
-        n, steps = trajectory.x.shape[:2]
-        Console().print(
-            f"{n} trajectories of {steps} states, {float(trajectory.contact.mean()):.0%} of them after a contact, in {out}",
-            soft_wrap=True,
-            highlight=False,
-        )
+        n, states = trajectory.x.shape[:2]
+        share = float(trajectory.contact.mean())
+        text = f"Wrote {n} trajectories of {states} states to {out}; {share:.0%} of the states follow a contact."
+        Console().print(text, soft_wrap=True, highlight=False)

@@ -14,7 +14,7 @@ def property_names(system: System) -> list[str]:
     owners: list[list[str]] = [[] for _ in range(system.n_properties)]
     for contact in system.contacts:
         for bodies, index in zip(contact.bodies_of(), contact.property_index, strict=True):
-            owners[index].append("-".join(map(str, bodies)) if len(bodies) > 1 else f"{bodies[0]}-wall")
+            owners[index].append("-".join(map(str, bodies)) + ("-wall" if len(bodies) == 1 else ""))
     return [
         names[0] if len(names) == 1 else "all contacts" if len(owners) == 1 else f"{names[0]} ..." for names in owners
     ]

@@ -9,7 +9,7 @@ with `f = (f_n, f_t)` stacked by contact and the normal component first. See `so
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -74,11 +74,11 @@ class _Iterate(NamedTuple):
     w: Float[Array, "K B"]  # multiplier of the bound
 
 
-def _dot(a, b):
+def _dot(a: Array, b: Array) -> Array:
     return jnp.sum(a * b, axis=1)
 
 
-def _det(x):
+def _det(x: Array) -> Array:
     """`x_0^2 - |x_1|^2`: positive inside the second-order cone."""
     norm = jnp.sqrt(_dot(x[:, 1:], x[:, 1:]))
     return (x[:, 0] - norm) * (x[:, 0] + norm)
@@ -101,7 +101,7 @@ class _Scaling(NamedTuple):
     inverse: Float[Array, "K d B"]
 
     @classmethod
-    def of(cls, s, z):
+    def of(cls, s: Array, z: Array):
         det_s, det_z = _det(s), _det(z)
         s_bar, z_bar = s / jnp.sqrt(det_s)[:, None], z / jnp.sqrt(det_z)[:, None]
         gamma = jnp.sqrt((1 + _dot(s_bar, z_bar)) / 2)
@@ -185,7 +185,7 @@ class _NewtonMatrix:
         return jnp.where(rotated, self.scaling.restore(x), x)
 
 
-def _largest_step(x, dx):
+def _largest_step(x: Array, dx: Array) -> Array:
     """Largest `a` with `x + a dx` in the second-order cone, for each contact."""
     det = _det(x)
     cross = x[:, 0] * dx[:, 0] - _dot(x[:, 1:], dx[:, 1:])
@@ -194,7 +194,7 @@ def _largest_step(x, dx):
     return jnp.where(denominator > 0, det / jnp.where(denominator > 0, denominator, 1), jnp.inf)
 
 
-def _largest_step_line(x, dx):
+def _largest_step_line(x: Array, dx: Array) -> Array:
     return jnp.where(dx < 0, -x / jnp.where(dx < 0, dx, -1), jnp.inf)
 
 
@@ -311,11 +311,11 @@ class _Scales(NamedTuple):
     S: Float[Array, "K d B"]  # y_scaled * S * unit = f
     size: Float[Array, "K B"]  # 1 / sqrt(A_nn): y_scaled * size * unit = (f_n, g_t)
     unit: Float[Array, " B"]
-    delta: Float[Array, " B"]
+    diagonal: Float[Array, " B"]  # delta
     regularization: Float[Array, "K d B"]  # the diagonal that delta becomes in the scaled problem
 
 
-def _scale(A, v, friction, lower, delta) -> tuple[_Problem, _Scales]:
+def _scale(A: Array, v: Array, friction: Array, lower: Array, delta: float) -> tuple[_Problem, _Scales]:
     """Batch last: A (K, d, K, d, B), v (K, d, B), friction, lower (K, B)."""
     k, d, batch = v.shape
     dtype = v.dtype
@@ -324,12 +324,12 @@ def _scale(A, v, friction, lower, delta) -> tuple[_Problem, _Scales]:
     # A contact without inverse inertia is padding. It becomes: minimise f_n^2 / 2 + f_n, with the solution 0.
     present = normal > 0
     mean = jnp.sum(jnp.where(present, normal, 0), axis=0) / jnp.maximum(jnp.sum(present, axis=0, dtype=dtype), 1)
-    delta = delta * mean
-    size = jnp.where(present, jax.lax.rsqrt(jnp.where(present, normal + delta, 1)), 0)
+    diagonal = delta * mean
+    size = jnp.where(present, jax.lax.rsqrt(jnp.where(present, normal + diagonal, 1)), 0)
     S = size[:, None] * jnp.concatenate(
         [jnp.ones((k, 1, batch), dtype), jnp.broadcast_to(friction[:, None], (k, d - 1, batch))], axis=1
     )
-    regularization = S**2 * delta
+    regularization = S**2 * diagonal
     # Rows that vanish (padding, tangents of frictionless contacts) get an own diagonal to be definite.
     floor = jnp.where(present[:, None], jnp.asarray(jnp.finfo(dtype).eps, dtype), 1)
     Q = S[:, :, None, None] * A * S[None, None]
@@ -342,7 +342,7 @@ def _scale(A, v, friction, lower, delta) -> tuple[_Problem, _Scales]:
     q = jnp.where(present[:, None], q / unit, jnp.zeros_like(q).at[:, 0].set(1))
     lower = jnp.where(bounded, jnp.maximum(lower / unit, _LIFT), _NO_BOUND)
     problem = _Problem(Q.reshape(k * d, k * d, batch), q, lower)
-    return problem, _Scales(S, size, unit, delta, regularization)
+    return problem, _Scales(S, size, unit, diagonal, regularization)
 
 
 # A bound at the cone's apex (lower = 0, as for restitution 0) is lifted by this fraction of the problem's scale, so
@@ -357,7 +357,7 @@ class _Internal(NamedTuple):
 
     impulse: Float[Array, "B K d"]
     residual: Float[Array, " B"]
-    iterations: Int[Array, " B"]
+    iterations: Any  # int (B,); its tangent is of JAX's type for no tangent at all
 
 
 class _Sensitivity(NamedTuple):
@@ -403,7 +403,7 @@ def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
         regular=jnp.moveaxis(size * scales.unit * it.y, -1, 0),
         inverse=jnp.moveaxis(inverse * both, -1, 0),
         bound=(it.w / it.u / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
-        diagonal=scales.delta,
+        diagonal=scales.diagonal,
     )
 
 
@@ -579,8 +579,8 @@ def solve_cone_problem(
     least normal impulses (N s), >= 0, or `None` for zero; `smoothing`, final value of the complementarity products
     relative to the problem's scale. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
-    A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is the
-    one of least norm. The iterations run in double precision where that is enabled, whatever the dtype of the
+    A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is
+    the one of least norm. The iterations run in double precision where that is enabled, whatever the dtype of the
     data. Differentiable once, in forward and reverse mode.
 
     **Source:** paper, eqs. 5 and 7, appendix C; method: Vandenberghe, *The CVXOPT linear and quadratic cone program

@@ -86,11 +86,12 @@ def target_velocity(
     depth: Float[Array, " K"],
     constraint_jacobian: Float[Array, "E n d"],
     *,
-    time: float,
+    time: float | Float[Array, ""],
 ) -> Float[Array, "K d"]:
     """Velocity after impact that undoes the penetration `depth` (m) within `time` (s), consistent with the joints.
 
-    `v* = J_C (I - J_E^T (J_E J_E^T)^-1 J_E) J_C^+ v_d` (S.23 with its misprint mended), `v_d = depth / time` along normals.
+    `v* = J_C (I - J_E^T (J_E J_E^T)^-1 J_E) J_C^+ v_d` (S.23 with its misprint mended), `v_d = depth / time` along
+    normals.
     The pseudo-inverse of S.24 is taken as the limit of `J_C^T (J_C J_C^T + delta)^-1`, which covers both its cases,
     redundant contacts, and the zero rows of contacts that are not active. No gradient flows through it.
     """
@@ -116,8 +117,8 @@ def _solve_regular(matrix, rhs, relative):
 def _solve(A, v, friction, lower, smoothing) -> ConeSolution:
     batch = v.shape[:-2]
 
-    def flat(x, rank):
-        return None if x is None else x.reshape(-1, *x.shape[x.ndim - rank :])
+    def flat(x: Array, rank: int) -> Array:
+        return x.reshape(-1, *x.shape[x.ndim - rank :])
 
     out = solve_cone_problem(flat(A, 2), flat(v, 2), flat(friction, 1), flat(lower, 1), smoothing=smoothing)
     return ConeSolution(out.impulse.reshape(v.shape), out.residual.reshape(batch), out.iterations.reshape(batch))
@@ -149,6 +150,6 @@ def _check_solved(solution: ConeSolution, dtype):
         require(
             worst <= tolerance,
             f"the impulse was not found: the optimality conditions are off by {worst:.1e} (allowed {tolerance:.0e}). "
-            "Either A is not positive semi-definite, or the contacts squeeze a body from both sides and v cannot be met by "
-            "any impulse. Check A = J M^-1 J^T and that v and v_star are in the range of J.",
+            "Either A is not positive semi-definite, or the contacts squeeze a body from both sides and v cannot be "
+            "met by any impulse. Check A = J M^-1 J^T and that v and v_star are in the range of J.",
         )

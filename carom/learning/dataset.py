@@ -61,8 +61,8 @@ class Chunks(eqx.Module):
 class Dataset(eqx.Module):
     """Recordings to learn from: `train` to fit, `val` to stop and choose by.
 
-    Build one from recordings (`load_recording`) or simulated trajectories (`Recording.of`), or let `Dataset.split` divide
-    one recording.
+    Build one from recordings (`load_recording`) or simulated trajectories (`Recording.of`), or let `Dataset.split`
+    divide one recording.
     """
 
     train: Recording

@@ -63,15 +63,15 @@ def evaluate(
 ) -> tuple[dict[str, Any], Trajectory]:
     """Measures of `system` on test recordings, and its predictions.
 
-    **Arguments:** `system`, learned; `recording`, test data; `truth`, the true system where it is known, for the errors of
-    properties and the drift of the true energy.
+    **Arguments:** `system`, learned; `recording`, test data; `truth`, the true system where it is known, for the errors
+    of properties and the drift of the true energy.
 
     **Returns:** a dictionary of numbers (definitions: the paper, section 5 and appendix L; the first of each pair below
     is the paper's) with
 
     - `trajectory_error`: mean over time, then over trajectories, of the relative error, with `_ci95`, half of the 95 %
-      interval of that mean; `_median` over trajectories; `_geometric`, geometric mean over time, mean over trajectories;
-      `bounded_error`: mean of the bounded form.
+      interval of that mean; `_median` over trajectories; `_geometric`, geometric mean over time, mean over
+      trajectories; `bounded_error`: mean of the bounded form.
     - `energy_drift`: largest `|E - E_0| / max |E|` along predictions of a system that keeps energy, by the true system.
     - `constraint_error`: largest `|Phi|` (m^2).
     - `friction_error`, `restitution_error` (absolute, by property) and `mass_ratio_error` (relative, by body).
@@ -81,8 +81,8 @@ def evaluate(
     shape = (system.n_points, system.dim)
     require(
         recording.x.shape[2:] == shape,
-        f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {shape[0]} in {shape[1]}D. Is it "
-        "a file of another task?",
+        f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {shape[0]} in "
+        f"{shape[1]}D. Is it a file of another task?",
     )
     predicted = predict(system, recording, formulation=formulation)
     relative, bounded = state_errors(recording, predicted)

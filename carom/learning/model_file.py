@@ -10,10 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
 from carom.learning.models import NeuralPotential
-from carom.learning.run import write_atomically
 from carom.system import System
 
 MAGIC = b"carom model 1\n"
@@ -42,7 +42,7 @@ def save_model(path: str | Path, system: System, *, formulation: str = "lagrangi
             "depth": network.depth,
             "dtype": str(network.layers[0].weight.dtype),
         }
-    write_atomically(Path(path), MAGIC + json.dumps(header).encode() + b"\n" + payload)
+    write_whole(Path(path), MAGIC + json.dumps(header).encode() + b"\n" + payload)
 
 
 def read_model_header(path: str | Path) -> dict[str, Any]:
@@ -59,8 +59,8 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
     shape = (header["points"], header["dim"])
     require(
         shape == (skeleton.n_points, skeleton.dim),
-        f"the model {path} is of a system with {shape[0]} points in {shape[1]}D; the skeleton has {skeleton.n_points} in "
-        f"{skeleton.dim}D. Give the skeleton it was learned with.",
+        f"the model {path} is of a system with {shape[0]} points in {shape[1]}D; the skeleton has "
+        f"{skeleton.n_points} in {skeleton.dim}D. Give the skeleton it was learned with.",
     )
     if header["network"] is not None:
         potential = NeuralPotential(
@@ -76,8 +76,8 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
         return eqx.tree_deserialise_leaves(io.BytesIO(payload), skeleton)
     except (RuntimeError, ValueError, EOFError, TypeError) as error:
         raise CaromError(
-            f"the model {path} does not fit the skeleton ({str(error).splitlines()[0]}). Give the skeleton it was learned with, "
-            "in the same precision."
+            f"the model {path} does not fit the skeleton ({str(error).splitlines()[0]}). Give the skeleton it was "
+            "learned with, in the same precision."
         ) from error
 
 

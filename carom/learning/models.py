@@ -16,8 +16,8 @@ class NeuralPotential(Potential):
     """A potential energy learned as a multi-layer perceptron of all points, with softplus units.
 
     **Arguments:** `n_points`, `dim`: of the system; `width`, `depth`: units of a hidden layer, number of hidden layers;
-    `key`: random key of the initial weights; `dtype`: of the weights and of the evaluation (single precision by default,
-    also inside of simulations in double).
+    `key`: random key of the initial weights; `dtype`: of the weights and of the evaluation (single precision by
+    default, also inside of simulations in double).
     """
 
     network: eqx.nn.MLP
@@ -44,8 +44,9 @@ class NeuralPotential(Potential):
 class Unknowns(eqx.Module):
     """Everything that is learned of a system; `None` for what is known and stays the skeleton's.
 
-    Masses are learned as ratios to that of the first body, `mass_i = mass_0 exp(log_mass_ratio_i)`: motion does not tell
-    the unit of mass, since masses and potential can be scaled together. A rigid body's moments scale with its mass.
+    Masses are learned as ratios to that of the first body, `mass_i = mass_0 exp(log_mass_ratio_i)`: motion does not
+    tell the unit of mass, since masses and potential can be scaled together. A rigid body's moments scale with its
+    mass.
     """
 
     log_mass_ratio: Float[Array, " bodies_after_first"] | None

@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
 
@@ -21,29 +21,6 @@ CONFIG, TRUTH, METRICS, REPORT, MODEL = (
     "report.json",
     "model.carom",
 )
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that it is there whole, or as it was before.
-
-    **Raises:** `CaromError` if the folder is missing or not writable.
-    """
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise CaromError(
-            f"cannot write {path}: {error.strerror}. Choose a folder that exists and that you may write to."
-        ) from error
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 class RunFolder:
@@ -98,7 +75,7 @@ class RunFolder:
 
     def write_json(self, name: str, content: Any) -> None:
         """Write a JSON file of the run."""
-        write_atomically(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+        write_whole(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
 
     # --- metrics ---------------------------------------------------------------------------------------------
 
@@ -126,7 +103,7 @@ class RunFolder:
     def rewind_metrics(self, epoch: int) -> None:
         """Drop the lines after `epoch`: they will be made again."""
         kept = [m for m in self.metrics() if m["epoch"] <= epoch]
-        write_atomically(self.path / METRICS, "".join(json.dumps(m) + "\n" for m in kept).encode())
+        write_whole(self.path / METRICS, "".join(json.dumps(m) + "\n" for m in kept).encode())
 
     # --- checkpoints -----------------------------------------------------------------------------------------
 

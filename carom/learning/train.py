@@ -17,13 +17,14 @@ from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_fla
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.progress import TrainingProgress
 from carom.learning.run import RunFolder
+from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
 from carom.simulation.rollout import COMPENSATION_STEPS, Stepper, step
 from carom.system import System
 
 Model = Literal["clnn", "chnn"]
 Quantity = Literal["mass", "friction", "restitution", "potential"]
-FORMULATIONS = {"clnn": "lagrangian", "chnn": "hamiltonian"}
+FORMULATIONS: dict[Model, Formulation] = {"clnn": "lagrangian", "chnn": "hamiltonian"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +164,7 @@ def chunk_loss(
 
     def predict(x0, v0):
         def body(state, _):
-            out = step(system, *state, stepper)
+            out = step(system, state[0], state[1], stepper)
             return (out.x, out.v), out
 
         return jax.lax.scan(body, (x0, v0), length=x.shape[1] - 1)[1]
@@ -260,8 +261,8 @@ def check_not_inside(name: str, part: Recording, skeleton: System, valid: np.nda
         )
         require(
             False,
-            f"the {name} data have {what} (trajectory {trajectory}, sample {sample}, {-gaps[row, candidate]:.3g} m deep, "
-            f"{int(through.any(axis=1).sum())} samples in all). Check units, radii and walls.",
+            f"the {name} data have {what} (trajectory {trajectory}, sample {sample}, {-gaps[row, candidate]:.3g} m "
+            f"deep, {int(through.any(axis=1).sum())} samples in all). Check units, radii and walls.",
         )
 
 
@@ -277,8 +278,8 @@ def learn(
 
     **Arguments:**
 
-    - `skeleton`: bodies, constraints and contacts with their geometry. Its masses (but that of the first body, the unit of
-      all), potential, friction and restitution are not used where `config.learn` names them.
+    - `skeleton`: bodies, constraints and contacts with their geometry. Its masses (but that of the first body, the
+      unit of all), potential, friction and restitution are not used where `config.learn` names them.
     - `dataset`: training and validation recordings.
     - `config`: how; see `LearnConfig`.
     - `run`: a folder to keep metrics and checkpoints in. If it holds a checkpoint, the training goes on from there.
@@ -310,7 +311,7 @@ def learn(
     )
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
     held_out = _validation_chunks(val, skeleton, config)
-    before = run.metrics()[-1]["seconds"] if restored is not None and run.metrics() else 0.0
+    before = run.metrics()[-1]["seconds"] if run is not None and restored is not None else 0.0
     started = time.monotonic() - before
     loss = jnp.asarray(jnp.nan)
     stopped = False

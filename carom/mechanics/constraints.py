@@ -1,4 +1,4 @@
-"""Holonomic constraints: functions `Phi(x) = 0` of the points. Their derivatives come from automatic differentiation."""
+"""Holonomic constraints: functions `Phi(x) = 0` of the points, differentiated automatically."""
 
 import abc
 

@@ -99,8 +99,8 @@ def hamiltonian_field(
 
     The two constraints `Psi = (Phi, Phi')` give a matrix `[0, G; -G, S]`, so that S.4 needs `G` alone:
     `G beta = J v`, `G alpha = S beta - B v - J M^-1 F`, `x' = v - M^-1 J^T beta`,
-    `v' = M^-1 (F + J^T alpha + B^T beta)`, with `B = D_x (J v)` and `S = B M^-1 J^T - J M^-1 B^T`. Where the constraints hold,
-    `beta = 0` and this is the Lagrangian field.
+    `v' = M^-1 (F + J^T alpha + B^T beta)`, with `B = D_x (J v)` and `S = B M^-1 J^T - J M^-1 B^T`. Where the
+    constraints hold, `beta = 0` and this is the Lagrangian field.
     """
     free = inverse_mass @ force
     if not has_equations(constraints, x):

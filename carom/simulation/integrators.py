@@ -13,8 +13,8 @@ _B = np.array([1 / 8, 3 / 8, 3 / 8, 1 / 8])
 class RK4(diffrax.AbstractERK):
     """Fourth-order Runge-Kutta in Kutta's 3/8 form, with a fixed step. carom's default.
 
-    Nodes 0, 1/3, 2/3, 1; weights 1/8, 3/8, 3/8, 1/8 (Kutta, 1901; Hairer, Norsett, Wanner, *Solving Ordinary Differential
-    Equations I*, table II.1.2). It has no error estimate.
+    Nodes 0, 1/3, 2/3, 1; weights 1/8, 3/8, 3/8, 1/8 (Kutta, 1901; Hairer, Norsett, Wanner, *Solving Ordinary
+    Differential Equations I*, table II.1.2). It has no error estimate.
     """
 
     tableau = diffrax.ButcherTableau(

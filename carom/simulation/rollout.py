@@ -27,7 +27,7 @@ class Trajectory(eqx.Module):
 
     `x`, `v` (..., time, n, d) in m and m/s; `contact` (..., time): the step that ends here had a closed contact; `time`
     (time,) in s; `overflow` (..., time): closed contacts that found no place in the solver; `residual` (..., time): the
-    solver's relative residual. `simulate` raises where the last two say that a result is not right, unless it is traced.
+    solver's relative residual. `simulate` raises where the last two say that a result is wrong, unless it is traced.
     """
 
     x: Float[Array, "*b time n d"]
@@ -125,7 +125,7 @@ def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) ->
     """`steps` steps from one state (n, d): the pure function under `simulate`."""
 
     def body(state, force):
-        result = step(system, *state, stepper, force)
+        result = step(system, state[0], state[1], stepper, force)
         return (result.x, result.v), result
 
     _, out = jax.lax.scan(body, (x0, v0), force, length=steps)
@@ -238,7 +238,7 @@ def check_initial_state(system: System, x0, v0) -> None:
     if through.any():
         state, candidate = np.argwhere(through)[0]
         bodies = [b for contact in system.contacts for b in contact.bodies_of()][candidate]
-        raise_through(state, bodies, -gaps[state, candidate])
+        raise_through(int(state), bodies, float(-gaps[state, candidate]))
     drift = np.abs(np.asarray(system.constraints(x)))
     if drift.size and drift.max() > 2e-2:
         state, row = np.unravel_index(drift.argmax(), drift.shape)

@@ -46,8 +46,8 @@ def sample_free(
             break
     require(
         count >= n,
-        f"only {count} of {n} initial states without contact were found in {most_rounds} rounds of {size}: the bodies of this "
-        "system hardly fit. Make them smaller or fewer.",
+        f"only {count} of {n} initial states without contact were found in {most_rounds} rounds of {size}: the bodies "
+        "of this system hardly fit. Make them smaller or fewer.",
     )
     x, v = (np.concatenate(parts)[:n] for parts in zip(*kept, strict=True))
     return jnp.asarray(x), jnp.asarray(v)

@@ -4,6 +4,7 @@ from itertools import combinations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from carom.contact.candidates import Contact, DiskDisk, DiskPlane
 from carom.mechanics.bodies import PointMass
@@ -15,7 +16,7 @@ BOX_WALLS = (((0.0, 0.0), (1.0, 0.0)), ((1.0, 0.0), (-1.0, 0.0)), ((0.0, 0.0), (
 
 
 def box_contacts(n: int, *, individual: bool) -> list[Contact]:
-    """All pairs of `n` bodies, and each body with each wall; properties shared, or one a pair and one a body and wall."""
+    """All pairs of `n` bodies, and each body with each wall; one shared property, or individual ones."""
     pairs = list(combinations(range(n), 2))
     contacts: list[Contact] = [DiskDisk(pairs, property=range(len(pairs)) if individual else 0)]
     for k, (point, normal) in enumerate(BOX_WALLS):
@@ -30,17 +31,17 @@ class BouncingPoints(Task):
     name: str
     masses: tuple[float, ...]
     radii: tuple[float, ...]
-    friction: tuple[float, ...]
-    restitution: tuple[float, ...]
+    contact_friction: tuple[float, ...]
+    contact_restitution: tuple[float, ...]
     dt: float = 0.01
     steps: int = 100
 
     def system(self):
         return System(
             bodies=[PointMass(m, r) for m, r in zip(self.masses, self.radii, strict=True)],
-            contacts=box_contacts(len(self.masses), individual=len(self.friction) > 1),
-            friction=self.friction,
-            restitution=self.restitution,
+            contacts=box_contacts(len(self.masses), individual=len(self.contact_friction) > 1),
+            friction=np.array(self.contact_friction),
+            restitution=np.array(self.contact_restitution),
             name=self.name,
         )
 
@@ -56,11 +57,13 @@ class BouncingPoints(Task):
         return sample_free(system, key, n, draw)
 
 
-BP5_E = BouncingPoints("bp5-e", (0.1,) * 5, (0.1,) * 5, (0.0,), (1.0,))
+BP5_E = BouncingPoints(
+    name="bp5-e", masses=(0.1,) * 5, radii=(0.1,) * 5, contact_friction=(0.0,), contact_restitution=(1.0,)
+)
 BP5 = BouncingPoints(
-    "bp5",
+    name="bp5",
     masses=(0.05, 0.1, 0.3, 0.4, 0.5),
     radii=(0.05, 0.1, 0.13, 0.15, 0.18),
-    friction=(0.5, 0.4, 0.6, 0.8, 0.9, 1.1, 0.7, 0.1, 0.0, 0.3) + (0.1,) * 20,
-    restitution=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0) + (0.8,) * 20,
+    contact_friction=(0.5, 0.4, 0.6, 0.8, 0.9, 1.1, 0.7, 0.1, 0.0, 0.3) + (0.1,) * 20,
+    contact_restitution=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0) + (0.8,) * 20,
 )

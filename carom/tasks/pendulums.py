@@ -32,8 +32,8 @@ class ChainedPendulum(Task):
     name: str
     masses: tuple[float, ...]
     radii: tuple[float, ...]
-    friction: float
-    restitution: float
+    contact_friction: float
+    contact_restitution: float
     lengths: tuple[float, ...] = (0.35, 0.4, 0.35)
     dt: float = 0.01
     steps: int = 100
@@ -46,8 +46,8 @@ class ChainedPendulum(Task):
             constraints=[Tether(0, (0.0, 0.0), self.lengths[0]), *rods],
             contacts=[DiskPlane(range(n), point=(0.0, -1.0), normal=(0.0, 1.0))],
             potential=Gravity((0.0, -GRAVITY)),
-            friction=self.friction,
-            restitution=self.restitution,
+            friction=self.contact_friction,
+            restitution=self.contact_restitution,
             name=self.name,
         )
 
@@ -63,5 +63,9 @@ class ChainedPendulum(Task):
         return sample_free(system, key, n, draw)
 
 
-CP3 = ChainedPendulum("cp3", (0.1, 0.2, 0.15), (0.05, 0.15, 0.1), 0.5, 0.0)
-CP3_E = ChainedPendulum("cp3-e", (0.2, 0.13, 0.15), (0.15, 0.08, 0.1), 0.0, 1.0)
+CP3 = ChainedPendulum(
+    name="cp3", masses=(0.1, 0.2, 0.15), radii=(0.05, 0.15, 0.1), contact_friction=0.5, contact_restitution=0.0
+)
+CP3_E = ChainedPendulum(
+    name="cp3-e", masses=(0.2, 0.13, 0.15), radii=(0.15, 0.08, 0.1), contact_friction=0.0, contact_restitution=1.0
+)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import imageio.v2
+import jax
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -21,7 +22,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from PIL import Image
 
 from carom.checks import require
@@ -49,6 +50,8 @@ DPI = 100
 SHORTEST, LONGEST, HOLD = 4.0, 10.0, 0.8
 """Playing time (s) between which the speed is chosen; how long the last frame stays."""
 MOST_FRAMES = 500
+FAR = 1e6
+"""What is farther away (m) is lost."""
 RING_FRAMES = 10
 """For how many frames a new contact flashes."""
 TINT, TINT_EDGE, HATCH = "#BBD6EA", "#6FA8CF", "#D3D8DE"
@@ -78,14 +81,14 @@ def animate(
 
     - `system`: gives radii, links and walls.
     - `true`, `predicted`: one trajectory each, `x` (time, n, d), at the same times; `true` may be
-      None.
+      None. Where one goes on after the other's end, that part is left out.
     - `path`: ends in .gif, or in .mp4, which needs the package imageio-ffmpeg.
     - `fps`: frames a second at most; samples in between are left out.
     - `speed`: 1 is real time. By default real time, but so that it takes from 4 to 10 s.
     - `trail`: how much of the past (s) trails behind the bodies; by default a quarter of the whole.
     - `width`: of the picture (pixels).
 
-    **Raises:** `CaromError` for trajectories that do not fit the system or each other, arguments
+    **Raises:** `CaromError` for trajectories that do not fit the system, arguments
     out of range, or a path that cannot be written.
     """
     path = checked_path(path, (".gif", ".mp4"))
@@ -102,11 +105,8 @@ def animate(
     _check("predicted", predicted, system)
     if true is not None:
         _check("true", true, system)
-        require(
-            true.x.shape == predicted.x.shape,
-            f"true and predicted must have equally many samples; they had {true.x.shape[0]} and "
-            f"{predicted.x.shape[0]}.",
-        )
+        count = min(true.x.shape[0], predicted.x.shape[0])
+        true, predicted = _first(true, count), _first(predicted, count)
     time = np.asarray(predicted.time, float)
     frames, speed, delay = _schedule(time, fps, speed)
     share = 0.25 if trail is None else min(trail / max(float(np.ptp(time)), 1e-12), 1.0)
@@ -132,6 +132,10 @@ def _check(name: str, trajectory: Trajectory, system: System) -> None:
     )
 
 
+def _first(trajectory: Trajectory, count: int) -> Trajectory:
+    return jax.tree.map(lambda a: a[:count], trajectory)
+
+
 def _schedule(time: np.ndarray, fps: float, speed: float | None) -> tuple[np.ndarray, float, float]:
     """Samples to show, the speed (1 is real time), and for how long (s) each is shown."""
     duration = float(np.ptp(time))
@@ -152,6 +156,12 @@ def _camera(dim: int) -> np.ndarray:
         return np.eye(2)
     (sa, ca), (se, ce) = ((np.sin(a), np.cos(a)) for a in (AZIMUTH, ELEVATION))
     return np.array([[-sa, -se * ca], [ca, -se * sa], [0, ce]])
+
+
+def _positions(trajectory: Trajectory, far: float) -> np.ndarray:
+    """Points (time, n, d), NaN where they are farther than `far` (m) from the origin."""
+    x = np.asarray(trajectory.x, float)
+    return np.where(np.abs(x) < far, x, np.nan)
 
 
 class _Lines(NamedTuple):
@@ -192,7 +202,7 @@ def _lines_of(system: System) -> _Lines:
 
 def _touching(system: System, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Where bodies can touch (time, C, d), and whether they did (time, C)."""
-    x = np.asarray(trajectory.x, float)[:, list(system.table.center)]
+    x = _positions(trajectory, FAR)[:, list(system.table.center)]
     radii = np.asarray(system.radii, float)
     places, gaps = [np.zeros((len(x), 0, system.dim))], [np.zeros((len(x), 0))]
     for contact in system.contacts:
@@ -244,7 +254,7 @@ def _walls_of(system: System) -> list[_Wall]:
 
 def _box(system: System, trajectory: Trajectory, anchors: np.ndarray) -> np.ndarray:
     """Lower and upper corner (2, d) of all that the trajectory reaches."""
-    x = np.asarray(trajectory.x, float)[:, list(system.table.center)]
+    x = _positions(trajectory, FAR)[:, list(system.table.center)]
     radii = np.asarray(system.radii, float)[:, None]
     reached = np.concatenate([(x - radii).reshape(-1, system.dim), (x + radii).reshape(-1, system.dim), anchors])
     reached = reached[np.isfinite(reached).all(axis=1)]
@@ -283,7 +293,9 @@ class _Picture:
         self.frames, self.speed, self.time = frames, speed, np.asarray(predicted.time, float)
         camera, lines, walls = _camera(system.dim), _lines_of(system), _walls_of(system)
         box = _view_box(system, true, predicted, lines.anchors, walls)
-        low, high = _framed(box, camera)
+        squares = [square @ camera for square in _planes(walls, box)] if system.dim == 3 else []
+        corners = np.array(np.meshgrid(*box.T)).reshape(system.dim, -1).T @ camera
+        low, high = _framed(np.concatenate([corners, *squares]))
         inner = width - 2 * MARGIN
         scale = inner / (high[0] - low[0])
         scene = round(scale * (high[1] - low[1]))
@@ -296,10 +308,10 @@ class _Picture:
         if system.dim == 2:
             _draw_walls(axes, walls)
         else:
-            _draw_planes(axes, walls, box, camera)
+            _draw_planes(axes, squares)
             _draw_triad(axes, camera)
         anchors = lines.anchors @ camera
-        axes.plot(*anchors.T, "o", color=INK, markersize=4.5, zorder=1)
+        (self.pivots,) = axes.plot(*anchors.T, "o", color=INK, markersize=5, zorder=5)
 
         self.parts: list[_Bodies | _Contacts | _ErrorPanel] = []
         if true is None:
@@ -315,10 +327,10 @@ class _Picture:
             self.parts.append(_ErrorPanel(panel_axes, self.time, true, predicted))
 
         self.canvas: Any = FigureCanvasAgg(self.figure)
-        for part in self.parts:
-            for artist in part.artists:
-                artist.set_animated(True)
-        self.clock.set_animated(True)
+        moving = [artist for part in self.parts for artist in part.artists]
+        self.moving = sorted([*moving, self.pivots, self.clock], key=lambda a: a.get_zorder())
+        for artist in self.moving:
+            artist.set_animated(True)
         self.canvas.draw()
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
@@ -363,8 +375,7 @@ class _Picture:
         self.canvas.restore_region(self.background)
         for part in self.parts:
             part.update(frame, sample)
-        moving = [a for part in self.parts for a in part.artists]
-        for artist in sorted([*moving, self.clock], key=lambda a: a.get_zorder()):
+        for artist in self.moving:
             self.figure.draw_artist(artist)
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
 
@@ -390,9 +401,7 @@ class _Bodies:
     """Disks, links and trails of one trajectory."""
 
     def __init__(self, axes, system, trajectory, lines, camera, past, look: _Look):
-        far = 1e3 * float(np.diff(axes.get_xlim())[0])
-        x = np.asarray(trajectory.x, float)
-        x = np.where(np.abs(x) < far, x, np.nan)
+        x = _positions(trajectory, 1e3 * float(np.diff(axes.get_xlim())[0]))
         self.centers = x[:, list(system.table.center)] @ camera
         # A point that is not finite takes only its own lines along: 0 * NaN is not 0.
         known = np.nan_to_num(x)
@@ -414,7 +423,7 @@ class _Bodies:
             zorder=look.order + 0.1,
         )
         self.links = LineCollection(
-            [], colors=look.edge, linewidths=look.link_width, capstyle="round", zorder=look.order
+            [], colors=look.edge, linewidths=look.link_width, capstyle="butt", zorder=look.order
         )
         self.past, self.steps = past, max(1, min(30, past))
         color, strongest = look.trail
@@ -483,14 +492,15 @@ class _ErrorPanel:
         self.time, self.error = time, _relative_error(true, predicted)
         positive = self.error[self.error > 0]
         low, high = (positive.min(), positive.max()) if positive.size else (1e-9, 1e-9)
-        high = min(max(high, 1e-12), 1e3)
-        low = max(min(low, high / 10), high * 1e-8)
-        self.drawn = np.clip(self.error, low / 2, high)
+        high = 10 ** np.ceil(np.log10(np.clip(high, 1e-12, 1e3)) + 0.1)
+        low = 10 ** np.floor(np.log10(np.clip(low, high * 1e-8, high / 10)))
+        self.drawn = np.clip(self.error, low, high)
         axes.set_yscale("log")
-        axes.set(xlim=(time[0], max(time[-1], time[0] + 1e-9)), ylim=(low / 2, high * 2))
+        axes.set(xlim=(time[0], max(time[-1], time[0] + 1e-9)), ylim=(low, high))
         axes.set_xlabel("time (s)", fontsize=8, labelpad=1)
         axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
         axes.yaxis.set_major_locator(LogLocator(numticks=3))
+        axes.yaxis.set_minor_locator(NullLocator())
         axes.tick_params(labelsize=7.5)
         axes.plot(time, self.drawn, color="#C9CED6", linewidth=1.2)
         touched = time[np.asarray(predicted.contact, bool)]
@@ -509,9 +519,8 @@ class _ErrorPanel:
         self.text.set_text("not finite" if np.isnan(value) else power(float(value)))
 
 
-def _framed(box: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower left and upper right of the picture's frame, neither very flat nor very high."""
-    corners = np.array(np.meshgrid(*box.T)).reshape(len(camera), -1).T @ camera
+def _framed(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower left and upper right of a frame around corners (k, 2), neither very flat nor high."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     size = np.maximum(high - low, 1e-6)
     size = size + 0.14 * size.max()
@@ -555,22 +564,27 @@ def _draw_walls(axes: Axes, walls: list[_Wall]) -> None:
             axes.plot(*np.array([a, b]).T, color=MUTED, linewidth=1.6, solid_capstyle="projecting")
 
 
-def _draw_planes(axes: Axes, walls: list[_Wall], box: np.ndarray, camera: np.ndarray) -> None:
-    """A grid on each plane that is near."""
-    reach = 0.6 * _extent(box)
+def _planes(walls: list[_Wall], box: np.ndarray) -> list[np.ndarray]:
+    """Squares (4, 3) on the planes that are near."""
+    reach, middle = 0.55 * _extent(box), box.mean(axis=0)
+    squares = []
     for wall in walls:
-        gap = wall.gap(box.mean(axis=0))
-        if abs(gap) > 2 * reach:
-            continue
-        foot = box.mean(axis=0) - gap * wall.normal
-        tangents = np.linalg.svd(wall.normal[None])[2][1:] * reach
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        patch = (foot + corners @ tangents) @ camera
-        axes.add_patch(Polygon(patch, facecolor=SOLID, edgecolor=MUTED, linewidth=0.8, alpha=0.8))
-        for k in np.linspace(-1, 1, 9)[1:-1]:
-            for ends in ([[k, -1], [k, 1]], [[-1, k], [1, k]]):
-                line = (foot + np.array(ends) @ tangents) @ camera
-                axes.plot(*line.T, color=HATCH, linewidth=0.7, zorder=0.9)
+        gap = wall.gap(middle)
+        if abs(gap) < 3 * reach:
+            tangents = np.linalg.svd(wall.normal[None])[2][1:]
+            turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * reach
+            squares.append(middle - gap * wall.normal + turns @ tangents)
+    return squares
+
+
+def _draw_planes(axes: Axes, squares: list[np.ndarray]) -> None:
+    """Each square (4, 2) with a grid on it."""
+    for a, b, c, d in squares:
+        axes.add_patch(Polygon([a, b, c, d], facecolor=SOLID, edgecolor=MUTED, linewidth=0.8))
+        for k in np.linspace(0, 1, 9)[1:-1]:
+            for start, end in (((a, b), (d, c)), ((a, d), (b, c))):
+                line = [p + k * (q - p) for p, q in (start, end)]
+                axes.plot(*np.transpose(line), color=HATCH, linewidth=0.7, zorder=1)
 
 
 def _draw_triad(axes: Axes, camera: np.ndarray) -> None:
@@ -581,37 +595,50 @@ def _draw_triad(axes: Axes, camera: np.ndarray) -> None:
     for name, direction in zip("xyz", camera, strict=True):
         tip = origin + length * direction
         axes.plot(*np.array([origin, tip]).T, color=MUTED, linewidth=1.2)
-        axes.text(*(origin + 1.35 * length * direction), name, ha="center", va="center", color=MUTED)
+        x, y = origin + 1.35 * length * direction
+        axes.text(x, y, name, ha="center", va="center", color=MUTED)
 
 
 # --- files ---------------------------------------------------------------------------------------
 
 
-def _palette(samples: Iterable[np.ndarray]) -> Image.Image:
-    """One palette for all frames, so that colors do not flicker; the style's own are exact."""
-    tiled: Any = Image.fromarray(np.concatenate(list(samples), axis=1))
-    quantized = tiled.quantize(256, dither=Image.Dither.NONE)
-    palette = np.array(quantized.getpalette()).reshape(-1, 3)
-    for color in (TINT, VERMILLION, ORANGE, MUTED, SOLID, INK, PAPER):
-        exact = (np.array(to_rgb(color)) * 255).round()
-        distance = np.abs(palette - exact).sum(axis=1)
-        palette[distance <= max(distance.min(), 8)] = exact
-    image = Image.new("P", (1, 1))
-    image.putpalette(palette.astype(np.uint8).tobytes())
-    return image
+def _palette(samples: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Palette (256, 3) for all frames, so that colors do not flicker, and its table (32768,).
+
+    The table maps the upper five bits of red, green and blue to the nearest color; the colors of
+    large areas are exact.
+    """
+    tiled = Image.fromarray(np.concatenate(list(samples), axis=1))
+    palette = np.reshape(tiled.quantize(248).getpalette() or [], (-1, 3)).astype(float)
+    exact = np.array([to_rgb(c) for c in (PAPER, SOLID, INK, MUTED, TINT, BLUE, VERMILLION, ORANGE)])
+    palette = np.concatenate([(exact * 255).round(), palette])
+    bins = 8 * np.stack(np.meshgrid(*[np.arange(32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 4
+    # Of |b - p|^2 the part that depends on p.
+    table = np.argmin(np.sum(palette**2, axis=1) - 2 * bins @ palette.T, axis=1)
+    table[_bin(palette[: len(exact)].astype(np.uint8))] = np.arange(len(exact))
+    return palette.astype(np.uint8), table.astype(np.uint8)
+
+
+def _bin(colors: np.ndarray) -> np.ndarray:
+    red, green, blue = np.moveaxis(colors.astype(np.int32) >> 3, -1, 0)
+    return red << 10 | green << 5 | blue
 
 
 def _write_gif(path: Path, picture: _Picture, delay: float) -> None:
     count = len(picture.frames)
     spread = np.unique(np.linspace(0, count - 1, min(count, 8)).astype(int))
-    palette = _palette(picture.draw(k) for k in spread)
-    images = (
-        Image.fromarray(picture.draw(k)).quantize(palette=palette, dither=Image.Dither.NONE) for k in range(count)
-    )
+    palette, table = _palette(picture.draw(k) for k in spread)
+
+    def indexed(k: int) -> Image.Image:
+        image = Image.fromarray(table[_bin(picture.draw(k))])
+        image.putpalette(palette.tobytes())
+        return image
+
     # GIF counts in 10 ms, and viewers slow down what is under 20 ms.
     shown = max(20, round(delay * 100) * 10)
     durations = [shown] * (count - 1) + [shown + round(HOLD * 1000)]
-    next(images).save(path, save_all=True, append_images=images, duration=durations, loop=0)
+    rest = (indexed(k) for k in range(1, count))
+    indexed(0).save(path, save_all=True, append_images=rest, duration=durations, loop=0)
 
 
 def _write_mp4(path: Path, picture: _Picture, delay: float) -> None:

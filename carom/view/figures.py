@@ -35,7 +35,7 @@ SMALLEST_SPAN = 0.1
 DASHES = (0, (4, 2))
 
 NOT_FINITE = 1e300
-"""Stands in for values that are not finite where quantiles are taken."""
+"""Stands in for infinite values where quantiles are taken."""
 
 LARGEST_ERROR = 1e3
 """A relative error beyond this says no more than this does."""
@@ -155,8 +155,8 @@ def trajectory_error(
     """Relative error over time, median and interquartile band; returns the PNG's path.
 
     **Arguments:** `time` (T,) in s; `errors`, by the model's name, (N, T): the relative error of N
-    trajectories. An error that is not finite counts as larger than all others, and the legend says
-    how many trajectories have one.
+    trajectories. NaN stands for times at which there is none, and is left out. An infinite error
+    counts as larger than all others, and the legend says how many trajectories have one.
 
     **Raises:** `CaromError` for shapes that do not fit, or a path that cannot be written.
     """
@@ -169,8 +169,8 @@ def trajectory_error(
             lower, median, upper = _quartiles(values)
             # On a logarithmic axis an exact start has no place: curves begin at the first error.
             shown = median > 0
-            broken = int(np.sum(~np.isfinite(values).all(axis=1)))
-            label = f"{name} ({broken} of {len(values)} not finite)" if broken else name
+            lost = int(np.sum(np.isinf(values).any(axis=1)))
+            label = f"{name} ({lost} of {len(values)} not finite)" if lost else name
             if _log_line(axes, seconds, median, color=color, linestyle=dashes, label=label):
                 drawn = True
                 if len(values) > 1:
@@ -289,12 +289,18 @@ def _curves(time, curves, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 def _quartiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quartiles over the first axis; what is not finite counts as largest, and comes out as NaN."""
-    filled = np.where(np.isfinite(values), values, NOT_FINITE)
-    quartiles = np.quantile(filled, [0.25, 0.5, 0.75], axis=0)
+    """Quartiles over the first axis of what is not NaN.
+
+    Infinite values count as the largest: a median of them is NaN, an upper quartile infinite.
+    """
+    quartiles = np.full((3, values.shape[1]), np.nan)
+    measured = ~np.isnan(values).all(axis=0)
+    filled = np.where(np.isinf(values), NOT_FINITE, values)[:, measured]
+    quartiles[:, measured] = np.nanquantile(filled, [0.25, 0.5, 0.75], axis=0)
     # Halfway to the stand-in is still far beyond anything that was measured.
-    lower, median, upper = np.where(quartiles > NOT_FINITE * 1e-6, np.nan, quartiles)
-    return lower, median, np.where(np.isnan(upper), np.inf, upper)
+    lost = quartiles > NOT_FINITE * 1e-6
+    lower, median, upper = np.where(lost, [[np.nan], [np.nan], [np.inf]], quartiles)
+    return lower, median, upper
 
 
 # --- drawing -------------------------------------------------------------------------------------
