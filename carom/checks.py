@@ -26,7 +26,7 @@ def require_values(name: str, value, condition, wanted: str) -> None:
         raise CaromError(f"{name} must be {wanted}; it was {_show(value)}.")
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: bool | np.bool_, message: str) -> None:
     """Raise `CaromError(message)` unless `condition`."""
     if not condition:
         raise CaromError(message)

@@ -5,6 +5,9 @@ import sys
 import time
 from pathlib import Path
 
+# XLA logs pages about the processor for each program it loads from the cache.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 import jax
 import jaxtyping
 import pytest

@@ -588,7 +588,8 @@ def solve_cone_problem(
     """
     dtype = v.dtype
     settings = ConeSettings.for_dtype(dtype, smoothing)
-    work = jnp.promote_types(dtype, jnp.zeros((), float).dtype)
+    widest = jnp.zeros((), float).dtype
+    work = widest if widest.itemsize > dtype.itemsize else dtype
     lower = jnp.full_like(friction, -jnp.inf) if lower is None else lower
     out = _impulse(*(x.astype(work) for x in (A, v, friction, lower)), settings)
     return ConeSolution(out.impulse.astype(dtype), out.residual.astype(dtype), out.iterations)

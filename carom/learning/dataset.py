@@ -20,8 +20,8 @@ class Chunks(eqx.Module):
     """
 
     length: int = eqx.field(static=True)  # states in a chunk
-    smooth: tuple[Int[np.ndarray, " *"], ...]  # starts, by trajectory
-    impact: tuple[Int[np.ndarray, " *"], ...]
+    smooth: tuple[Int[np.ndarray, " _"], ...]  # starts, by trajectory
+    impact: tuple[Int[np.ndarray, " _"], ...]
 
     @classmethod
     def of(cls, contact: Bool[np.ndarray, "N T"], valid: Int[np.ndarray, " N"], length: int) -> "Chunks":

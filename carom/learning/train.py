@@ -46,7 +46,11 @@ class LearnConfig:
     contact_share: float = 0.5
     """Share of the chunks that are drawn with a contact, where a trajectory has any."""
     learning_rate: float = 3e-3
-    """Peak learning rate of AdamW; it decays to zero along a cosine."""
+    """Peak learning rate of the network (AdamW); it decays to zero along a cosine."""
+    property_learning_rate: float = 2e-2
+    """Peak learning rate of masses, friction and restitution."""
+    loss_width: float = 0.1
+    """Errors below this share of the data's speed count quadratically at the start (see `smooth_error`)."""
     weight_decay: float = 1e-4
     """Weight decay of the network (physical quantities are not decayed)."""
     patience: int = 100
@@ -73,7 +77,9 @@ class LearnConfig:
             require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
         require(self.chunk_length >= 2, f"chunk_length must be at least 2 states; it was {self.chunk_length}.")
         require(0 <= self.contact_share <= 1, f"contact_share must be in [0, 1]; it was {self.contact_share}.")
-        require(self.learning_rate > 0, f"learning_rate must be positive; it was {self.learning_rate}.")
+        for name in ("learning_rate", "property_learning_rate"):
+            require(getattr(self, name) > 0, f"{name} must be positive; it was {getattr(self, name)}.")
+        require(self.loss_width >= 0, f"loss_width must not be negative; it was {self.loss_width}.")
         require(self.weight_decay >= 0, f"weight_decay must not be negative; it was {self.weight_decay}.")
         require(self.compensation_steps > 0, f"compensation_steps must be positive; it was {self.compensation_steps}.")
         require(self.initial_friction >= 0, f"initial_friction must be at least 0; it was {self.initial_friction}.")
@@ -141,24 +147,42 @@ def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
 
 
 def make_optimizer(config: LearnConfig, steps: int, unknowns: Unknowns) -> optax.GradientTransformation:
-    """AdamW with cosine decay; weight decay acts on the network alone."""
+    """AdamW with cosine decay: weight decay for the network alone, a learning rate of their own for the properties."""
     schedule = optax.cosine_decay_schedule(config.learning_rate, steps)
     arrays = eqx.filter(unknowns, eqx.is_inexact_array)
-    decayed = eqx.tree_at(
+    is_network = eqx.tree_at(
         lambda u: u.potential,
         jax.tree.map(lambda _: False, arrays),
         jax.tree.map(lambda _: True, arrays.potential),
         is_leaf=lambda x: x is None,
     )
-    return optax.adamw(schedule, weight_decay=config.weight_decay, mask=decayed)
+    is_property = jax.tree.map(lambda flag: not flag, is_network)
+    return optax.chain(
+        optax.adamw(schedule, weight_decay=config.weight_decay, mask=is_network),
+        optax.masked(optax.scale(config.property_learning_rate / config.learning_rate), is_property),
+    )
 
 
-def chunk_loss(
+LOSS_WIDTH_DECAY = 1e-4
+"""How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
+
+
+def smooth_error(error: Float[Array, "*shape"], width: Float[Array, ""]) -> Float[Array, ""]:
+    """Mean of `sqrt(error^2 + width^2) - width`: the mean absolute error but for a quadratic part of `width`.
+
+    Masses and restitutions meet in valleys of the absolute error with sharp floors, along which no single quantity can
+    move: the smooth floor of a wide loss lets them travel together; narrowing it then gives the exact fit of the
+    absolute error (Charbonnier et al., 1994; graduated as in Blake and Zisserman, *Visual Reconstruction*, 1987).
+    """
+    return jnp.mean(jnp.sqrt(error**2 + width**2) - width)
+
+
+def chunk_errors(
     unknowns: Unknowns, skeleton: System, stepper: Stepper, x: Float[Array, "B L n d"], v: Float[Array, "B L n d"]
-) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Mean absolute error of positions (m) and velocities (m/s) predicted from each chunk's first state.
+) -> tuple[Float[Array, "B M n d"], Float[Array, "B M n d"], Int[Array, ""]]:
+    """Errors of positions (m) and velocities (m/s) predicted from each chunk's first state, for the others.
 
-    Also returns how many closed contacts found no place in the solver.
+    Also how many closed contacts found no place in the solver.
     """
     system = unknowns.assemble(skeleton)
 
@@ -170,8 +194,17 @@ def chunk_loss(
         return jax.lax.scan(body, (x0, v0), length=x.shape[1] - 1)[1]
 
     out = jax.vmap(predict)(x[:, 0], v[:, 0])
-    loss = jnp.mean(jnp.abs(out.x - x[:, 1:])) + jnp.mean(jnp.abs(out.v - v[:, 1:]))
-    return loss, jnp.sum(out.overflow)
+    return out.x - x[:, 1:], out.v - v[:, 1:], jnp.sum(out.overflow)
+
+
+def chunk_loss(unknowns: Unknowns, skeleton: System, stepper: Stepper, x, v, width):
+    """What is minimised, with (mean absolute error of positions plus that of velocities, overflow) beside it.
+
+    `width` (m/s) is that of the quadratic part for velocities; for positions it is `width dt`.
+    """
+    error_x, error_v, overflow = chunk_errors(unknowns, skeleton, stepper, x, v)
+    loss = smooth_error(error_x, width * stepper.dt) + smooth_error(error_v, width)
+    return loss, (jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v)), overflow)
 
 
 def gather_chunks(x, v, trajectory, start, length: int):
@@ -181,11 +214,12 @@ def gather_chunks(x, v, trajectory, start, length: int):
 
 
 @eqx.filter_jit
-def train_step(data, unknowns, opt_state, optimizer, stepper, length):
+def train_step(data, unknowns, opt_state, optimizer, stepper, length, width):
     """One step of the optimiser. A step whose gradient is not finite is left out and counted."""
     skeleton, x, v, trajectory, start = data
     chunk = gather_chunks(x, v, trajectory, start, length)
-    (loss, overflow), grads = eqx.filter_value_and_grad(chunk_loss, has_aux=True)(unknowns, skeleton, stepper, *chunk)
+    gradient = eqx.filter_value_and_grad(chunk_loss, has_aux=True)
+    (loss, (error, overflow)), grads = gradient(unknowns, skeleton, stepper, *chunk, width)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes its counters with floats
         updates, new_state = optimizer.update(grads, opt_state, eqx.filter(unknowns, eqx.is_inexact_array))
     new = eqx.apply_updates(unknowns, updates).project()
@@ -198,13 +232,14 @@ def train_step(data, unknowns, opt_state, optimizer, stepper, length):
 
     unknowns = jax.tree.map(choose, new, unknowns)
     opt_state = jax.tree.map(choose, new_state, opt_state)
-    return unknowns, opt_state, loss, overflow, ~finite
+    return unknowns, opt_state, error, overflow, ~finite
 
 
 @eqx.filter_jit
 def validate(unknowns, skeleton, x, v, stepper):
-    """Loss of chunks that are not trained on."""
-    return chunk_loss(unknowns, skeleton, stepper, x, v)[0]
+    """Mean absolute error of positions plus that of velocities, for chunks that are not trained on."""
+    error_x, error_v, _ = chunk_errors(unknowns, skeleton, stepper, x, v)
+    return jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v))
 
 
 def fresh_state(skeleton: System, config: LearnConfig, steps: int) -> tuple[TrainState, optax.GradientTransformation]:
@@ -307,9 +342,15 @@ def learn(
         dt=jnp.asarray(train.dt),
         formulation=FORMULATIONS[config.model],
         project=config.project,
-        compensation_steps=config.compensation_steps,
+        compensation_steps=float(config.compensation_steps),
     )
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
+    speed = float(np.sqrt(np.mean(train.v[np.arange(train.v.shape[1]) < train.length[:, None]] ** 2)))
+
+    def width(epoch: int) -> Float[Array, ""]:
+        done = (epoch - 1) / config.epochs
+        return jnp.asarray(config.loss_width * speed * LOSS_WIDTH_DECAY**done, train.x.dtype)
+
     held_out = _validation_chunks(val, skeleton, config)
     before = run.metrics()[-1]["seconds"] if run is not None and restored is not None else 0.0
     started = time.monotonic() - before
@@ -317,7 +358,7 @@ def learn(
     stopped = False
     with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
-            state, loss = _epoch(state, epoch, trained, x, v, chunks, optimizer, stepper, config)
+            state, loss = _epoch(state, epoch, trained, x, v, chunks, optimizer, stepper, width(epoch), config)
             val_loss = validate(state.unknowns, trained, *held_out, stepper)
             state = _keep_best(state, val_loss, epoch)
             rate = config.learning_rate * (1 + np.cos(np.pi * epoch / config.epochs)) / 2
@@ -369,7 +410,7 @@ def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
     return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.chunk_length)
 
 
-def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, stepper, config):
+def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, stepper, width, config):
     """Learn from `chunks_per_epoch` new chunks. Their choice depends on seed and epoch alone, so that it can resume."""
     rng = np.random.default_rng((config.seed, 0, epoch))
     unknowns, opt_state = state.unknowns, state.optimizer
@@ -379,10 +420,10 @@ def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, ste
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
         data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
         unknowns, opt_state, loss, over, bad = train_step(
-            data, unknowns, opt_state, optimizer, stepper, config.chunk_length
+            data, unknowns, opt_state, optimizer, stepper, config.chunk_length, width
         )
         losses.append(loss)
-        overflow, skipped = overflow + over, skipped + bad
+        overflow, skipped = overflow + over, skipped + bad.astype(skipped.dtype)
     state = dataclasses.replace(
         state, unknowns=unknowns, optimizer=opt_state, epoch=jnp.asarray(epoch), overflow=overflow, skipped=skipped
     )

@@ -4,7 +4,7 @@ Notation: `G = J_E M^-1 J_E^T`, with `J_E = D_x Phi` from automatic differentiat
 """
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -15,6 +15,10 @@ from jaxtyping import Array, Float
 Formulation = Literal["lagrangian", "hamiltonian"]
 
 
+def _spd(matrix: Float[Array, "E E"]) -> lx.MatrixLinearOperator:
+    return lx.MatrixLinearOperator(matrix, lx.positive_semidefinite_tag)
+
+
 class SaddlePoint(eqx.Module):
     """The constraints at one state, with `G` factored once: every use of the multipliers goes through here.
 
@@ -23,20 +27,25 @@ class SaddlePoint(eqx.Module):
 
     jacobian: Float[Array, "E n d"]
     inverse_mass: Float[Array, "n n"]
-    operator: lx.MatrixLinearOperator
-    state: object
+    matrix: Float[Array, "E E"]
+    factor: Any
 
     def __init__(self, jacobian: Float[Array, "E n d"], inverse_mass: Float[Array, "n n"]):
         self.jacobian, self.inverse_mass = jacobian, inverse_mass
         G = self.to_rows(self.from_impulses(jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)))
-        self.operator = lx.MatrixLinearOperator((G + G.T) / 2, lx.positive_semidefinite_tag)
-        # The derivative of a solve comes from the operator; the factor is only a shortcut to its value.
-        state = lx.Cholesky().init(self.operator, {})
-        self.state = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, state)
+        self.matrix = (G + G.T) / 2
+        self.factor = lx.Cholesky().init(_spd(jax.lax.stop_gradient(self.matrix)), {})
 
     def solve(self, rhs: Float[Array, " E"]) -> Float[Array, " E"]:
-        """`G^-1 rhs`."""
-        return lx.linear_solve(self.operator, rhs, lx.Cholesky(), state=self.state, throw=False).value
+        """`G^-1 rhs`. Its derivative comes from the equation `G y = rhs` and uses the same factor."""
+
+        def solve(_, b):
+            operator = _spd(jax.lax.stop_gradient(self.matrix))
+            return lx.linear_solve(operator, b, lx.Cholesky(), state=self.factor, throw=False).value
+
+        # Not lineax's own derivative: that stops the program at the first number that is not finite, where a training
+        # should leave the step out and go on.
+        return jax.lax.custom_linear_solve(lambda y: self.matrix @ y, rhs, solve, symmetric=True)
 
     def to_rows(self, velocity: Float[Array, "k n d"]) -> Float[Array, "E k"]:
         """`J_E v` for several velocities."""

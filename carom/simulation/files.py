@@ -157,10 +157,12 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
         encode = _format(path).encode
         fields = {name: getattr(recording, name) for name in (*ARRAYS, "dt", *TEXTS)}
         checked = Recording.of(**{**fields, "carom_version": _version()})
-        absent = {"contact"} if checked.contact is None else set()
-        absent |= {"length"} if (checked.length == checked.x.shape[1]).all() else set()
-        content = {name: getattr(checked, name) for name in fields if name not in absent}
-        _write(path, encode({**content, "checksum": _checksum(content)}))
+        content = {name: getattr(checked, name) for name in fields}
+        if checked.contact is None:
+            del content["contact"]
+        if (checked.length == checked.x.shape[1]).all():
+            del content["length"]
+        _write(path, encode({"checksum": _checksum(content), **content}))
     except CaromError as error:
         raise CaromError(f"{path}: {error}") from error.__cause__
 
@@ -384,8 +386,11 @@ def _encode_hdf5(content: Mapping[str, Any]) -> io.BytesIO:
 
 def _decode_npz(path: Path) -> dict[str, Any]:
     advice = "name it by its format, or copy or make it again"
-    _check(zipfile.is_zipfile(path), "the file", "be NPZ", "something else or truncated", advice)
-    with np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as file:
+        good = zipfile.is_zipfile(file)
+        _check(good, "the file", "be NPZ", "something else or truncated", advice)
+        file.seek(0)
+        archive = np.load(file, allow_pickle=False)
         arrays = {name: _npz_array(archive, name) for name in _arrays_in(archive)}
         return {**arrays, **_attributes(archive)}
 
@@ -404,6 +409,8 @@ def _npz_array(archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 def _encode_npz(content: Mapping[str, Any]) -> io.BytesIO:
     buffer = io.BytesIO()
+    # The checksum comes first and x second: damage to the table of contents that hides the checksum
+    # and what follows is then found by the missing x, any other by the checksum.
     np.savez(buffer, **content)
     return buffer
 

@@ -18,7 +18,7 @@ from carom.system import System
 
 ImpactRule = Literal["step"]
 
-COMPENSATION_STEPS = 8
+COMPENSATION_STEPS = 8.0
 """Time steps over which a penetration is undone, by default (paper, appendix G)."""
 
 
@@ -211,7 +211,7 @@ def simulate(
         formulation=formulation,
         solver=RK4() if solver is None else solver,
         project=project,
-        compensation_steps=compensation_steps,
+        compensation_steps=None if compensation_steps is None else float(compensation_steps),
         smoothing=smoothing,
     )
     out = _simulate(system, x0, v0, stepper, int(steps), force)

@@ -33,11 +33,14 @@ from carom.simulation.rollout import Trajectory
 from carom.system import System
 from carom.view.style import (
     BLUE,
+    HATCH,
     INK,
     MUTED,
     ORANGE,
     PAPER,
     SOLID,
+    TINT,
+    TINT_EDGE,
     VERMILLION,
     checked_path,
     figure_style,
@@ -54,7 +57,6 @@ FAR = 1e6
 """What is farther away (m) is lost."""
 RING_FRAMES = 10
 """For how many frames a new contact flashes."""
-TINT, TINT_EDGE, HATCH = "#BBD6EA", "#6FA8CF", "#D3D8DE"
 AZIMUTH, ELEVATION = np.radians(-60), np.radians(20)
 """From where a system in 3D is seen; the third axis is up."""
 MARGIN, HEADER, PANEL = 14, 58, 104
@@ -67,9 +69,9 @@ def animate(
     predicted: Trajectory,
     path: str | os.PathLike[str],
     *,
-    fps: float = 25.0,
-    speed: float | None = None,
-    trail: float | None = None,
+    fps: float | int = 25,
+    speed: float | int | None = None,
+    trail: float | int | None = None,
     width: int = 500,
 ) -> Path:
     """Draw `predicted` as outlines over `true` as filled disks; returns the path.
@@ -136,7 +138,7 @@ def _first(trajectory: Trajectory, count: int) -> Trajectory:
     return jax.tree.map(lambda a: a[:count], trajectory)
 
 
-def _schedule(time: np.ndarray, fps: float, speed: float | None) -> tuple[np.ndarray, float, float]:
+def _schedule(time: np.ndarray, fps: float | int, speed: float | int | None) -> tuple[np.ndarray, float, float]:
     """Samples to show, the speed (1 is real time), and for how long (s) each is shown."""
     duration = float(np.ptp(time))
     if duration <= 0:
@@ -237,8 +239,8 @@ class _Wall(NamedTuple):
     point: np.ndarray
     normal: np.ndarray
 
-    def gap(self, x: np.ndarray) -> np.ndarray:
-        return (x - self.point) @ self.normal
+    def gap(self, x: np.ndarray) -> float:
+        return float((x - self.point) @ self.normal)
 
 
 def _walls_of(system: System) -> list[_Wall]:
@@ -368,7 +370,7 @@ class _Picture:
 
     def draw(self, frame: int) -> np.ndarray:
         """Pixels (height, width, 3) of this frame."""
-        sample = self.frames[frame]
+        sample = int(self.frames[frame])
         decimals = 2 if self.time[-1] >= 0.5 else 3
         pace = "" if abs(self.speed - 1) < 0.01 else f"   ({self.speed:.2g}× speed)"
         self.clock.set_text(f"t = {self.time[sample]:.{decimals}f} s{pace}")
@@ -418,7 +420,8 @@ class _Bodies:
             offsets=self.centers[0],
             offset_transform=axes.transData,
             facecolors=look.face,
-            edgecolors=look.edge,
+            # Twice, as a single style would be drawn as a marker: on whole pixels, by jerks.
+            edgecolors=[look.edge] * 2,
             linewidths=look.disk_width,
             zorder=look.order + 0.1,
         )
@@ -492,7 +495,7 @@ class _ErrorPanel:
         self.time, self.error = time, _relative_error(true, predicted)
         positive = self.error[self.error > 0]
         low, high = (positive.min(), positive.max()) if positive.size else (1e-9, 1e-9)
-        high = 10 ** np.ceil(np.log10(np.clip(high, 1e-12, 1e3)) + 0.1)
+        high = 10 ** np.ceil(np.log10(np.clip(high, 1e-12, 1e3)))
         low = 10 ** np.floor(np.log10(np.clip(low, high * 1e-8, high / 10)))
         self.drawn = np.clip(self.error, low, high)
         axes.set_yscale("log")
@@ -626,7 +629,7 @@ def _bin(colors: np.ndarray) -> np.ndarray:
 
 def _write_gif(path: Path, picture: _Picture, delay: float) -> None:
     count = len(picture.frames)
-    spread = np.unique(np.linspace(0, count - 1, min(count, 8)).astype(int))
+    spread = np.unique(np.linspace(0, count - 1, min(count, 8)).astype(int)).tolist()
     palette, table = _palette(picture.draw(k) for k in spread)
 
     def indexed(k: int) -> Image.Image:

@@ -171,11 +171,13 @@ def trajectory_error(
             shown = median > 0
             lost = int(np.sum(np.isinf(values).any(axis=1)))
             label = f"{name} ({lost} of {len(values)} not finite)" if lost else name
-            if _log_line(axes, seconds, median, color=color, linestyle=dashes, label=label):
-                drawn = True
-                if len(values) > 1:
-                    bottom = np.where(lower > 0, lower, np.nanmin(median[shown]) / 10)
-                    _band(axes, seconds, bottom, np.minimum(upper, 1e6), color, shown)
+            if not _log_line(axes, seconds, median, color=color, linestyle=dashes, label=label):
+                axes.plot([], [], color=color, linestyle=dashes, label=label)
+                continue
+            drawn = True
+            if len(values) > 1:
+                bottom = np.where(lower > 0, lower, np.nanmin(median[shown]) / 10)
+                _band(axes, seconds, bottom, np.minimum(upper, 1e6), color, shown)
         if drawn:
             axes.set_yscale("log")
             low, high = axes.get_ylim()

@@ -27,6 +27,8 @@ and for text.
 INK, MUTED, FAINT, SOLID = "#20242B", "#69707B", "#E4E7EB", "#F3F4F6"
 """Text and truth; less important text; grid; the solid side of walls."""
 PAPER = "#FFFFFF"
+TINT, TINT_EDGE, HATCH = "#BBD6EA", "#6FA8CF", "#D3D8DE"
+"""Bodies and their edges; the hatching of walls."""
 
 DPI = 160
 """Pixels an inch of the figures."""
@@ -84,7 +86,7 @@ def figure_style() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float, height: float, *, dpi: float = DPI, constrained: bool = True) -> Figure:
+def new_figure(width: float, height: float, *, dpi: int = DPI, constrained: bool = True) -> Figure:
     """An empty figure of `width` by `height` inches, drawn by Agg."""
     figure = Figure((width, height), dpi=dpi, layout="constrained" if constrained else None)
     FigureCanvasAgg(figure)

@@ -1,0 +1,117 @@
+"""Unknowns and learned potentials, and the file that holds a learned model."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import carom
+from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
+
+
+@pytest.fixture(scope="module")
+def cp3():
+    return carom.task("cp3")
+
+
+@pytest.fixture(scope="module")
+def unknowns():
+    potential = NeuralPotential(3, 2, width=8, depth=2, key=jax.random.key(0))
+    return Unknowns(jnp.log(jnp.array([3.0, 0.5])), jnp.array([0.7]), jnp.array([0.2]), potential)
+
+
+def test_assemble_fills_in_every_unknown_and_keeps_geometry(cp3, unknowns):
+    system = unknowns.assemble(cp3)
+    assert np.allclose(mass_ratios(system), [1, 3, 0.5], rtol=1e-12)
+    assert np.allclose(system.masses[0], cp3.masses[0])
+    assert system.friction.tolist() == [0.7]
+    assert system.restitution.tolist() == [0.2]
+    assert np.array_equal(system.radii, cp3.radii)
+    assert isinstance(system.potential, NeuralPotential)
+
+
+def test_what_is_known_stays_the_skeletons(cp3):
+    system = Unknowns(None, None, jnp.array([0.2]), None).assemble(cp3)
+    assert np.array_equal(system.masses, cp3.masses)
+    assert np.array_equal(system.friction, cp3.friction)
+    assert isinstance(system.potential, carom.Gravity)
+
+
+def test_a_rigid_bodys_moments_scale_with_its_mass():
+    disk = carom.RigidBody(2.0, (0.3, 0.5), 0.1)
+    skeleton = carom.System(bodies=[carom.PointMass(1.0), disk])
+    system = Unknowns(jnp.log(jnp.array([4.0])), None, None, None).assemble(skeleton)
+    assert np.allclose(system.bodies[1].mass, 4.0)
+    assert np.allclose(system.bodies[1].moments, [0.6, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("friction", "restitution", "expected"),
+    [(-0.1, 1.2, (0.0, 1.0)), (0.0, 0.0, (0.0, 0.0)), (1.5, 0.3, (1.5, 0.3))],
+    ids=["outside", "at the ends", "inside"],
+)
+def test_project_reaches_the_ends_exactly(friction, restitution, expected):
+    out = Unknowns(None, jnp.array([friction]), jnp.array([restitution]), None).project()
+    assert (float(out.friction[0]), float(out.restitution[0])) == expected
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_learned_potential_works_in_either_precision(dtype):
+    potential = NeuralPotential(3, 2, width=8, depth=2, key=jax.random.key(1), dtype=dtype)
+    x = jax.random.normal(jax.random.key(2), (3, 2), jnp.float64)
+    value, gradient = jax.value_and_grad(potential)(x, jnp.eye(3))
+    assert value.dtype == gradient.dtype == jnp.float64
+    step = 1e-2 if dtype == jnp.float32 else 1e-5
+    direction = jax.random.normal(jax.random.key(3), (3, 2), jnp.float64)
+    difference = potential(x + step * direction, jnp.eye(3)) - potential(x - step * direction, jnp.eye(3))
+    # Central differences: rounding of the network over the step, plus its third derivative times the step squared.
+    tolerance = 1e-4 if dtype == jnp.float32 else 1e-8
+    assert np.isclose(difference / (2 * step), jnp.sum(gradient * direction), atol=tolerance)
+
+
+def test_model_file_round_trip(tmp_path, cp3, unknowns):
+    system = unknowns.assemble(cp3)
+    carom.save_model(tmp_path / "model.carom", system, formulation="hamiltonian")
+    header = read_model_header(tmp_path / "model.carom")
+    assert (header["task"], header["formulation"], header["points"]) == ("cp3", "hamiltonian", 3)
+    again = carom.load_model(tmp_path / "model.carom")
+    leaves, expected = jax.tree.leaves(again), jax.tree.leaves(system)
+    assert all(np.array_equal(a, b) for a, b in zip(leaves, expected, strict=True) if hasattr(a, "dtype"))
+    x = jnp.ones((3, 2))
+    assert again.potential_energy(x) == system.potential_energy(x)
+
+
+def test_a_model_of_an_own_system_needs_its_skeleton(tmp_path):
+    own = carom.System(bodies=[carom.PointMass(2.0)])
+    carom.save_model(tmp_path / "model.carom", own)
+    with pytest.raises(carom.CaromError, match="give the skeleton"):
+        carom.load_model(tmp_path / "model.carom")
+    again = carom.load_model(tmp_path / "model.carom", carom.System(bodies=[carom.PointMass(1.0)]))
+    assert again.masses.tolist() == [2.0]
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "foreign", "header", "missing"])
+def test_a_damaged_model_file_is_refused(tmp_path, cp3, unknowns, damage):
+    path = tmp_path / "model.carom"
+    carom.save_model(path, unknowns.assemble(cp3))
+    data = bytearray(path.read_bytes())
+    if damage == "flip":
+        data[len(data) // 2] ^= 1
+    elif damage == "cut":
+        del data[-10:]
+    elif damage == "foreign":
+        data[:] = b"something else"
+    elif damage == "header":
+        data[14:20] = b"\xff" * 6
+    path.write_bytes(data)
+    if damage == "missing":
+        path.unlink()
+    with pytest.raises(carom.CaromError, match=r"model\.carom"):
+        carom.load_model(path)
+
+
+def test_a_model_of_another_system_is_refused(tmp_path, cp3, unknowns):
+    carom.save_model(tmp_path / "model.carom", unknowns.assemble(cp3))
+    with pytest.raises(carom.CaromError, match="3 points in 2D"):
+        load_model_into(tmp_path / "model.carom", carom.task("bp5"))

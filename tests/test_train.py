@@ -1,0 +1,211 @@
+"""The trainer: it learns, it resumes, it refuses; and the paper's quantities at full length (slow)."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import refused
+
+import carom
+from carom.learning.dataset import Dataset
+from carom.learning.models import NeuralPotential, mass_ratios
+from carom.learning.run import RunFolder
+from carom.learning.train import initial_unknowns, learn
+
+TINY = carom.LearnConfig(
+    epochs=4, chunks_per_epoch=32, batch_size=16, chunk_length=3, width=16, depth=1, checkpoint_every=1
+)
+
+
+@pytest.fixture(scope="module")
+def cp3():
+    return carom.task("cp3")
+
+
+@pytest.fixture(scope="module")
+def data(cp3):
+    return Dataset.split(carom.make_recording(cp3, jax.random.key(0), 24), val=0.25)
+
+
+def numbers(system):
+    return np.concatenate([system.friction, system.restitution, mass_ratios(system)])
+
+
+def test_learning_lowers_the_loss_and_reports_it(cp3, data, tmp_path):
+    run = RunFolder.create(tmp_path / "run", {})
+    config = dataclasses.replace(TINY, epochs=8, learning_rate=1e-2)
+    system, report = learn(cp3, data, config, run=run, progress=False)
+    run.close()
+    metrics = run.metrics()
+    assert [m["epoch"] for m in metrics] == list(range(1, 9))
+    assert metrics[-1]["val_loss"] < 0.9 * metrics[0]["val_loss"]
+    assert report.val_loss == min(m["val_loss"] for m in metrics)
+    assert report.friction == system.friction.tolist()
+    assert report.skipped_steps == report.overflowed_contacts == 0
+    # The skeleton's own values are not what learning starts from, nor what it returns.
+    assert not np.allclose(numbers(system), numbers(cp3), atol=1e-2)
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(cp3, data, tmp_path):
+    whole = RunFolder.create(tmp_path / "whole", {})
+    expected, _ = learn(cp3, data, TINY, run=whole, progress=False)
+    whole.close()
+
+    class KilledError(Exception):
+        pass
+
+    class Dying(RunFolder):
+        def log(self, metrics):
+            super().log(metrics)
+            if metrics["epoch"] == 3:
+                raise KilledError
+
+    dying = Dying.create(tmp_path / "killed", {})
+    with pytest.raises(KilledError):
+        learn(cp3, data, TINY, run=dying, progress=False)
+    dying.close()
+    again = RunFolder.open(tmp_path / "killed")
+    assert again.metrics()[-1]["epoch"] == 3  # logged, but its checkpoint was not written
+    system, report = learn(cp3, data, TINY, run=again, progress=False)
+    again.close()
+    assert report.epochs == 4
+    assert [m["epoch"] for m in again.metrics()] == [1, 2, 3, 4]
+    assert np.array_equal(numbers(system), numbers(expected))
+    assert [m["val_loss"] for m in again.metrics()] == [m["val_loss"] for m in whole.metrics()]
+
+
+def test_early_stopping_keeps_the_best(cp3, data):
+    config = dataclasses.replace(TINY, epochs=40, patience=2, learning_rate=0.5)
+    _, report = learn(cp3, data, config, progress=False)
+    assert report.stopped_early
+    assert report.epochs < 40
+
+
+def test_only_what_is_asked_for_is_learned(cp3, data):
+    config = dataclasses.replace(TINY, learn=("friction", "restitution"), epochs=2)
+    system, _ = learn(cp3, data, config, progress=False)
+    assert isinstance(system.potential, carom.Gravity)
+    assert np.array_equal(system.masses, cp3.masses)
+    assert system.friction.tolist() != [config.initial_friction]
+
+
+def test_steps_without_a_finite_gradient_are_left_out_and_reported(cp3, data):
+    potential = NeuralPotential(3, 2, width=16, depth=1, key=jax.random.key(0))
+    broken = jax.tree.map(lambda a: a * jnp.nan if eqx.is_array(a) else a, potential)
+    skeleton = eqx.tree_at(lambda s: s.potential, cp3, broken)
+    with refused("the training loss is not finite (6 steps left out)"):
+        learn(skeleton, data, TINY, progress=False)
+
+
+def test_initial_values_are_those_of_the_configuration(cp3):
+    unknowns = initial_unknowns(cp3, dataclasses.replace(TINY, initial_friction=0.4, initial_restitution=1.0))
+    assert unknowns.friction.tolist() == [0.4]
+    assert unknowns.restitution.tolist() == [1.0]
+    assert not unknowns.log_mass_ratio.any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"epochs": 0}, "epochs must be at least 1"),
+        ({"chunk_length": 1}, "chunk_length"),
+        ({"contact_share": 1.5}, "contact_share"),
+        ({"learning_rate": 0.0}, "learning_rate"),
+        ({"weight_decay": -1.0}, "weight_decay"),
+        ({"initial_friction": -0.1}, "initial_friction"),
+        ({"initial_restitution": 1.1}, "initial_restitution"),
+        ({"compensation_steps": 0.0}, "compensation_steps"),
+        ({"model": "hnn"}, "model must be one of"),
+        ({"learn": ("colour",)}, "learn must name"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_bad_configuration_is_refused(change, message):
+    with refused(message):
+        carom.LearnConfig(**change)
+
+
+def test_data_that_do_not_fit_the_system_are_refused(cp3, data):
+    def changed(x):
+        return Dataset(carom.Recording.of(x, data.train.v, dt=0.01), data.val)
+
+    with refused("3 points in 2D"):
+        learn(carom.task("bp5"), data, TINY, progress=False)
+    with refused("do not fit the system's rods"):
+        learn(cp3, changed(data.train.x * 2), TINY, progress=False)
+    with refused("chunk_length is 200"):
+        learn(cp3, data, dataclasses.replace(TINY, chunk_length=200), progress=False)
+    bp5 = carom.task("bp5-e")
+    inside = carom.make_recording(bp5, jax.random.key(0), 4)
+    moved = carom.Recording.of(inside.x - 0.5, inside.v, dt=inside.dt)
+    with refused("in a wall"):
+        learn(bp5, Dataset(moved, moved), TINY, progress=False)
+
+
+# --- the paper's tasks at full length -------------------------------------------------------------
+
+
+def full_dataset(task, *, n=800, seed=0):
+    system = carom.task(task)
+    train, val = (carom.make_recording(system, jax.random.key(seed + k), count) for k, count in enumerate((n, n // 8)))
+    return system, Dataset(train, val)
+
+
+def check_learned(system, truth, *, properties=1e-3, masses=1e-3):
+    assert np.abs(system.friction - truth.friction).max() < properties
+    assert np.abs(system.restitution - truth.restitution).max() < properties
+    assert np.abs(mass_ratios(system) / mass_ratios(truth) - 1).max() < masses
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.timeout(800)
+def test_cp3_is_learned_from_its_own_data():
+    truth, dataset = full_dataset("cp3")
+    system, _ = learn(truth, dataset, progress=False)
+    check_learned(system, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize(
+    ("task", "model"),
+    [("cp3-e", "clnn"), ("bp5-e", "clnn"), ("cp3", "chnn")],
+    ids=["cp3-e", "bp5-e", "cp3 Hamiltonian"],
+)
+def test_elastic_tasks_and_the_hamiltonian_network(task, model):
+    truth, dataset = full_dataset(task)
+    system, _ = learn(truth, dataset, carom.LearnConfig(model=model), progress=False)
+    check_learned(system, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_cp3_is_learned_from_recordings_carom_did_not_make(reference_dir):
+    truth = carom.task("cp3")
+    data = carom.load_recording(reference_dir / "reference" / "cp3_observed.npz", task="cp3")
+    system, _ = learn(truth, Dataset.split(data), progress=False)
+    check_learned(system, truth)
+
+
+def test_single_precision_trains():
+    """Data, masses and properties in single precision: the solver still runs in double inside."""
+    skeleton = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if isinstance(a, jax.Array) and a.dtype == jnp.float64 else a,
+        carom.task("cp3"),
+    )
+    unknowns = initial_unknowns(skeleton, dataclasses.replace(TINY, learn=("friction",)))
+    assert unknowns.friction.dtype == jnp.float32
+    x0, v0 = (a.astype(jnp.float32) for a in carom.sample(carom.task("cp3"), jax.random.key(3), 16))
+
+    def loss(unknowns):
+        out = carom.simulate(unknowns.assemble(skeleton), x0, v0, dt=0.01, steps=100, project=False)
+        return jnp.mean(jnp.abs(out.x)) + jnp.mean(jnp.abs(out.v))
+
+    gradient = jax.grad(lambda mu: loss(dataclasses.replace(unknowns, friction=mu)))(unknowns.friction)
+    assert gradient.dtype == jnp.float32
+    assert np.isfinite(gradient).all()
+    assert float(gradient[0]) != 0
