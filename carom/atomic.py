@@ -18,7 +18,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     **Raises:** `CaromError` if the folder is missing, full, or not writable.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
-    temporary = target.parent / f".carom-{secrets.token_hex(8)}{target.suffix}"
+    temporary = target.parent / f".carom-{secrets.token_hex(8)}.tmp{target.suffix}"
     try:
         yield temporary
         with temporary.open("rb") as file:
@@ -26,8 +26,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
     except OSError as error:
         raise CaromError(
-            f"{path} cannot be written ({error.strerror or error}); choose a folder that exists, has room and can be "
-            "written to."
+            f"the file {target.name} cannot be written in {target.parent} ({error.strerror or error}); choose a folder "
+            "that exists, has room and can be written to."
         ) from error
     finally:
         with suppress(OSError):

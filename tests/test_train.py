@@ -125,7 +125,7 @@ def test_initial_values_are_those_of_the_configuration(cp3):
 )
 def test_a_bad_configuration_is_refused(change, message):
     with refused(message):
-        carom.LearnConfig(**change)
+        carom.LearnConfig(**change).check()
 
 
 def test_data_that_do_not_fit_the_system_are_refused(cp3, data):

@@ -71,6 +71,7 @@ class Learn:
 
     def _run(self, console: Console) -> None:
         truth = task(self.task)
+        self.config.check()
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
         folder = self._folder()
         if not self.resume:

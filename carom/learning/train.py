@@ -46,14 +46,14 @@ class LearnConfig:
     contact_share: float = 0.5
     """Share of the chunks that are drawn with a contact, where a trajectory has any."""
     learning_rate: float = 3e-3
-    """Peak learning rate of the network (AdamW); it decays to zero along a cosine."""
+    """Peak learning rate of the network (AdamW); it decays to zero along a squared cosine."""
     property_learning_rate: float = 2e-2
     """Peak learning rate of masses, friction and restitution."""
     loss_width: float = 0.1
     """Errors below this share of the data's speed count quadratically at the start (see `smooth_error`)."""
     weight_decay: float = 1e-4
     """Weight decay of the network (physical quantities are not decayed)."""
-    patience: int = 100
+    patience: int = 200
     """Stop after so many epochs without a better validation loss."""
     width: int = 256
     """Units in a hidden layer of the potential."""
@@ -72,7 +72,8 @@ class LearnConfig:
     checkpoint_every: int = 10
     """Epochs between checkpoints."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raise `CaromError` for a value that cannot be."""
         for name in ("epochs", "chunks_per_epoch", "batch_size", "patience", "width", "depth", "checkpoint_every"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
         require(self.chunk_length >= 2, f"chunk_length must be at least 2 states; it was {self.chunk_length}.")
@@ -146,9 +147,14 @@ def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
     )
 
 
+def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
+    """Half a cosine, squared: in late steps the unknowns settle, which takes longer than finding where."""
+    return optax.cosine_decay_schedule(config.learning_rate, steps, exponent=2.0)
+
+
 def make_optimizer(config: LearnConfig, steps: int, unknowns: Unknowns) -> optax.GradientTransformation:
-    """AdamW with cosine decay: weight decay for the network alone, a learning rate of their own for the properties."""
-    schedule = optax.cosine_decay_schedule(config.learning_rate, steps)
+    """AdamW with a decaying rate: weight decay for the network alone, a rate of their own for the properties."""
+    schedule = learning_rate_schedule(config, steps)
     arrays = eqx.filter(unknowns, eqx.is_inexact_array)
     is_network = eqx.tree_at(
         lambda u: u.potential,
@@ -325,6 +331,7 @@ def learn(
     **Raises:** `CaromError` if data, skeleton and configuration do not fit, or the loss stays not finite.
     """
     config = LearnConfig() if config is None else config
+    config.check()
     most = check_dataset(skeleton, dataset, config)
     # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
     trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
@@ -351,6 +358,7 @@ def learn(
         done = (epoch - 1) / config.epochs
         return jnp.asarray(config.loss_width * speed * LOSS_WIDTH_DECAY**done, train.x.dtype)
 
+    rate = learning_rate_schedule(config, config.epochs * steps)
     held_out = _validation_chunks(val, skeleton, config)
     before = run.metrics()[-1]["seconds"] if run is not None and restored is not None else 0.0
     started = time.monotonic() - before
@@ -361,14 +369,13 @@ def learn(
             state, loss = _epoch(state, epoch, trained, x, v, chunks, optimizer, stepper, width(epoch), config)
             val_loss = validate(state.unknowns, trained, *held_out, stepper)
             state = _keep_best(state, val_loss, epoch)
-            rate = config.learning_rate * (1 + np.cos(np.pi * epoch / config.epochs)) / 2
             metrics = {
                 "epoch": epoch,
                 "step": epoch * steps,
                 "seconds": round(time.monotonic() - started, 3),
                 "loss": float(loss),
                 "val_loss": float(val_loss),
-                "learning_rate": float(rate),
+                "learning_rate": float(np.asarray(rate(epoch * steps))),
                 **quantities(state.unknowns.assemble(skeleton)),
                 "skipped_steps": int(state.skipped),
                 "overflowed_contacts": int(state.overflow),

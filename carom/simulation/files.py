@@ -16,10 +16,8 @@ import hashlib
 import importlib.metadata
 import io
 import os
-import secrets
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +27,7 @@ import h5py
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from carom.atomic import write_whole
 from carom.errors import CaromError
 
 STEP_TOLERANCE = 1e-6
@@ -37,6 +36,7 @@ STEP_TOLERANCE = 1e-6
 STATE_AXES = ("trajectory", "time", "point", "axis")
 ARRAYS = ("x", "v", "time", "contact", "length")
 TEXTS = ("units", "task", "source", "carom_version")
+ATTRIBUTES = ("checksum", "dt", *TEXTS)
 
 
 class Recording(eqx.Module):
@@ -128,7 +128,7 @@ def load_recording(path: str | os.PathLike[str], *, task: str | None = None) -> 
         content = _read(path)
         checksum = content.pop("checksum", None)
         _check(
-            checksum in (None, _checksum(content)),
+            checksum is None or checksum == _checksum(content),
             "checksum",
             "match the data",
             "another: the file was damaged or changed after it was written",
@@ -162,7 +162,7 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
             del content["contact"]
         if (checked.length == checked.x.shape[1]).all():
             del content["length"]
-        _write(path, encode({"checksum": _checksum(content), **content}))
+        write_whole(path, encode({"checksum": _checksum(content), **content}).getbuffer())
     except CaromError as error:
         raise CaromError(f"{path}: {error}") from error.__cause__
 
@@ -230,8 +230,9 @@ def _flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
 
 def _text(name: str, value: Any) -> str:
     """A text, from what either format makes of it."""
-    array = np.asarray(value)
-    text = array.item() if array.size == 1 else None
+    text = value
+    if not isinstance(value, str | bytes):
+        text = np.asarray(value).item() if np.size(value) == 1 else None
     if isinstance(text, bytes):
         text = text.decode("utf-8", errors="surrogateescape")
     # No format holds a null character, and a lone surrogate stands for bytes that are no text.
@@ -258,7 +259,7 @@ def _time_step(value: Any) -> float:
     array = np.asarray(value)
     number = float(array.item()) if array.size == 1 and array.dtype.kind in "fiu" else np.nan
     advice = "give the time step in seconds"
-    _check(0 < number < np.inf, "dt", "be one positive number", repr(value), advice)
+    _check(0 < number < np.inf, "dt", "be one positive number", repr(array.tolist()), advice)
     return number
 
 
@@ -288,7 +289,8 @@ def _clock(time: Any, dt: Any, valid: np.ndarray) -> tuple[Float64[np.ndarray, "
     _check_steps(array, valid, rounding, axes)
 
     row = (array[longest] if raw.ndim == 2 else array)[inside]
-    step = float((row[-1] - row[0]) / (len(row) - 1))
+    with np.errstate(over="ignore"):
+        step = _time_step((row[-1] - row[0]) / (len(row) - 1))
     good = dt is None or abs(dt - step) <= STEP_TOLERANCE * step + rounding
     _check(good, "dt", f"be the step of time, {step:.9g} s", dt, "correct whichever is wrong")
     dt = step if dt is None else dt
@@ -344,9 +346,8 @@ def _arrays_in(names: Iterable[str]) -> list[str]:
     return [name for name in ARRAYS if name in names]
 
 
-def _attributes(stored: Mapping[str, Any]) -> dict[str, Any]:
-    content = {name: _text(name, stored[name]) for name in (*TEXTS, "checksum") if name in stored}
-    return {**content, "dt": _time_step(stored["dt"])} if "dt" in stored else content
+def _attribute(name: str, value: Any) -> float | str:
+    return _time_step(value) if name == "dt" else _text(name, value)
 
 
 # ----------------------------------------------------------------------------------------- formats
@@ -354,9 +355,29 @@ def _attributes(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def _decode_hdf5(path: Path) -> dict[str, Any]:
     _check(h5py.is_hdf5(path), "the file", "be HDF5", "something else", "name it by its format")
+    _check_heaps(path.read_bytes())
     with h5py.File(path, "r") as file:
         arrays = {name: _hdf5_array(file, name) for name in _arrays_in(file)}
-        return {**arrays, **_attributes(file.attrs)}
+        names = [name for name in ATTRIBUTES if name in file.attrs]
+        return {**arrays, **{name: _attribute(name, file.attrs[name]) for name in names}}
+
+
+def _check_heaps(data: bytes) -> None:
+    """Raise where a heap, in which HDF5 keeps texts, has an impossible size: libhdf5 would hang."""
+
+    def number(at: int, width: int) -> int:
+        return int.from_bytes(data[at : at + width], "little")
+
+    mark = b"GCOL\x01\0\0\0"  # then the size of the heap, then its objects
+    heap = data.find(mark)
+    while heap >= 0:
+        at, end = heap + 16, heap + number(heap + 8, 8)
+        while at + 16 <= end:  # an object: 2 bytes index, 6 others, 8 bytes size, its data
+            size = number(at + 8, 8)
+            step = 16 + (size + 7) // 8 * 8 if number(at, 2) else size  # index 0: what is free
+            _check(16 <= step <= end - at, "the file", "have whole texts", "damaged", "copy it again")
+            at += step
+        heap = data.find(mark, heap + 1)
 
 
 def _hdf5_array(file: h5py.File, name: str) -> np.ndarray:
@@ -367,8 +388,8 @@ def _hdf5_array(file: h5py.File, name: str) -> np.ndarray:
             f"{name} must be a dataset in the file itself; it was a group, a link or kept in "
             "another file; copy the numbers into this one."
         )
-    if dataset.dtype.hasobject:
-        return np.empty(dataset.shape, dtype=object)  # not read; the type is reported
+    numeric = dataset.shape is not None and not dataset.dtype.hasobject
+    _check(numeric, name, "hold floating-point numbers or integers", dataset.dtype)
     return np.asarray(dataset[()])
 
 
@@ -392,18 +413,18 @@ def _decode_npz(path: Path) -> dict[str, Any]:
         file.seek(0)
         archive = np.load(file, allow_pickle=False)
         arrays = {name: _npz_array(archive, name) for name in _arrays_in(archive)}
-        return {**arrays, **_attributes(archive)}
+        names = [name for name in ATTRIBUTES if name in archive]
+        return {**arrays, **{name: _attribute(name, _npz_array(archive, name)) for name in names}}
 
 
-def _npz_array(archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+def _npz_array(archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
     try:
         return archive[name]
     except ValueError as error:
         if "allow_pickle" not in str(error):
             raise
         raise CaromError(
-            f"{name} must hold floating-point numbers or integers; it was pickled objects, which "
-            "are never loaded; convert it to float64."
+            f"{name} must hold plain numbers or text; it was pickled objects, which are never loaded; convert it."
         ) from error
 
 
@@ -445,22 +466,3 @@ def _read(path: Path) -> dict[str, Any]:
         raise
     except Exception as error:  # inside of a damaged file the libraries fail in all kinds of ways
         raise CaromError(f"the file is damaged or truncated ({_brief(error)}); copy or make it again.") from error
-
-
-def _write(path: Path, data: io.BytesIO) -> None:
-    target = Path(os.path.realpath(path))  # a link stays a link
-    temporary = target.parent / f".carom-{secrets.token_hex(8)}.tmp"
-    try:
-        with temporary.open("xb") as file:
-            file.write(data.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        raise CaromError(
-            f"the file cannot be written in {target.parent} ({error.strerror or error}); choose a "
-            "folder that exists, has room and can be written to."
-        ) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)

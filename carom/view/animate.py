@@ -7,6 +7,7 @@ as in 2D.
 
 import importlib.util
 import os
+import warnings
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
@@ -647,7 +648,10 @@ def _write_gif(path: Path, picture: _Picture, delay: float) -> None:
 def _write_mp4(path: Path, picture: _Picture, delay: float) -> None:
     count = len(picture.frames)
     options: dict[str, Any] = {"fps": 1 / delay, "quality": 8, "macro_block_size": 2}
-    writer: Any = imageio.v2.get_writer(path, format="FFMPEG", **options)  # pyright: ignore
-    with writer:
-        for k in range(count + round(HOLD / delay)):
-            writer.append_data(picture.draw(min(k, count - 1)))
+    with warnings.catch_warnings():
+        # JAX and Python warn of a fork; this one runs ffmpeg at once, which is safe.
+        warnings.filterwarnings("ignore", r".*fork\(\)")
+        writer: Any = imageio.v2.get_writer(path, format="FFMPEG", **options)  # pyright: ignore
+        with writer:
+            for k in range(count + round(HOLD / delay)):
+                writer.append_data(picture.draw(min(k, count - 1)))

@@ -5,7 +5,6 @@ Figures are `matplotlib.figure.Figure` objects drawn by Agg; pyplot is never imp
 
 import contextlib
 import os
-import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from carom.atomic import replacing
 from carom.errors import CaromError
 
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -115,22 +115,6 @@ def checked_path(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
             f"path is in the folder {str(path.parent)!r}, which does not exist. Make it, or choose another path."
         )
     return path
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, which takes its place if the block ends without an error."""
-    temporary = path.with_name(f".{path.stem}-{uuid.uuid4().hex[:12]}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise CaromError(
-            f"path {str(path)!r} cannot be written: {error.strerror or error}. Choose another path."
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def note(axes: Axes, text: str) -> None:

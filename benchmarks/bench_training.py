@@ -1,0 +1,54 @@
+"""A training step with contact beside the same step with contact switched off. Ratios are what counts.
+
+`pytest benchmarks/bench_training.py` prints both for cp3 and bp5: 200 chunks of 5 states, half of them with a contact,
+from the tasks' own data; forward, gradient and update; after warm-up.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import carom
+from carom.learning.dataset import Chunks, closed_contacts
+from carom.learning.train import gather_chunks, initial_unknowns, make_optimizer, train_step
+from carom.simulation.rollout import Stepper
+
+CONFIG = carom.LearnConfig()
+
+
+@pytest.fixture(scope="module", params=["cp3", "bp5"])
+def training(request):
+    """The arguments of a training step, with contact."""
+    system = carom.task(request.param)
+    data = carom.make_recording(system, jax.random.key(0), 200)
+    chunks = Chunks.of(data.contact, data.length, CONFIG.chunk_length)
+    drawn = chunks.draw(np.random.default_rng(0), CONFIG.batch_size, CONFIG.contact_share)
+    skeleton = system.with_max_active(int(closed_contacts(data.x, system).max()) + 2)
+    unknowns = initial_unknowns(skeleton, CONFIG)
+    optimizer = make_optimizer(CONFIG, 1000, unknowns)
+    with jax.numpy_dtype_promotion("standard"):
+        state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
+    inputs = (skeleton, jnp.asarray(data.x), jnp.asarray(data.v), *(jnp.asarray(part) for part in drawn))
+    with_contact = float(np.mean(np.any(gather_chunks(data.contact, data.contact, *drawn, CONFIG.chunk_length)[0], 1)))
+    return request.param, inputs, unknowns, state, optimizer, with_contact
+
+
+@pytest.mark.parametrize("contact", [False, True], ids=["contact off", "contact on"])
+def test_training_step(benchmark, training, contact):
+    name, inputs, unknowns, state, optimizer, share = training
+    stepper = Stepper(dt=jnp.asarray(0.01), project=False, contact=contact)
+    width = jnp.asarray(0.1)
+
+    def run():
+        return jax.block_until_ready(
+            train_step(inputs, unknowns, state, optimizer, stepper, CONFIG.chunk_length, width)[2]
+        )
+
+    run()
+    benchmark.group = f"training step, {name}, {share:.0%} of the chunks with a contact"
+    benchmark.extra_info.update(task=name, contact=contact, config=dataclasses.asdict(CONFIG))
+    benchmark.pedantic(run, rounds=40, warmup_rounds=5)

@@ -1,0 +1,207 @@
+"""The command line as a user types it: results, files, and one clear line for what is wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import jax
+import jaxtyping
+import numpy as np
+import pytest
+from PIL import Image
+
+import carom
+from carom.cli.main import main
+from carom.learning.run import RunFolder
+
+TINY = [
+    *("--trajectories", "16", "--epochs", "2", "--chunks-per-epoch", "16", "--batch-size", "8"),
+    *("--chunk-length", "3", "--width", "8", "--depth", "1", "--checkpoint-every", "1"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _apart(tmp_path, monkeypatch):
+    """Each test in a folder of its own, without the user's cache; JAX's settings are put back afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAROM_CACHE", "")
+    cache = jax.config.jax_compilation_cache_dir
+    yield
+    jax.config.update("jax_compilation_cache_dir", cache)
+
+
+def command(*arguments):
+    main([str(a) for a in arguments])
+
+
+def refused(capsys, *arguments) -> str:
+    """Run a command that must fail: exit code 2 and one line, which is returned."""
+    jaxtyping.config.update("jaxtyping_disable", True)  # the run-time checks would speak first
+    try:
+        with pytest.raises(SystemExit) as stop:
+            command(*arguments)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("carom: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """A run folder of a tiny training."""
+    folder = tmp_path_factory.mktemp("learned")
+    environment = {**os.environ, "CAROM_CACHE": ""}
+    os.environ.update(environment)
+    command("learn", "cp3", "--out", folder / "run", *TINY)
+    return folder / "run"
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_learn_writes_a_whole_run_folder(learned):
+    names = {p.name for p in learned.iterdir()}
+    assert names == {
+        "config.json",
+        "truth.json",
+        "metrics.jsonl",
+        "checkpoints",
+        "model.carom",
+        "report.json",
+        "test.h5",
+        "learning_curves.png",
+        "contact_properties.png",
+        "trajectory_error.png",
+        "prediction.gif",
+    }
+    config = json.loads((learned / "config.json").read_text())
+    assert (config["task"], config["epochs"], config["model"]) == ("cp3", 2, "clnn")
+    assert [m["epoch"] for m in RunFolder.open(learned).metrics()] == [1, 2]
+    report = json.loads((learned / "report.json").read_text())
+    assert set(report) == {"learned", "evaluation", "touches"}
+    with Image.open(learned / "prediction.gif") as animation:
+        assert animation.n_frames > 20
+    assert carom.load_model(learned / "model.carom").friction.tolist() == report["learned"]["friction"]
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_evaluate_and_simulate_use_the_learned_model(learned, capsys):
+    command("evaluate", learned)
+    assert "trajectory relative error" in capsys.readouterr().out
+    measures = json.loads((learned / "evaluation.json").read_text())
+    assert measures["trajectories"] == 2
+    command("simulate", "cp3", "--run-folder", learned, "--trajectories", 2, "--steps", 5, "--out", "own.npz")
+    own = carom.load_recording("own.npz", task="cp3")
+    assert own.x.shape == (2, 6, 3, 2)
+    assert "model.carom" in own.source
+
+
+def test_simulate_writes_a_trajectory_file(capsys):
+    command("simulate", "bp5-e", "--trajectories", 3, "--steps", 7, "--seed", 4)
+    out = carom.load_recording("bp5-e.h5", task="bp5-e")
+    assert out.x.shape == (3, 8, 5, 2)
+    assert out.dt == pytest.approx(0.01)
+    with h5py.File("bp5-e.h5") as file:
+        assert {"dt", "units", "task", "source", "carom_version"} <= set(file.attrs)
+    command("simulate", "bp5-e", "--steps", 7, "--initial", "bp5-e.h5", "--out", "again.h5")
+    assert np.array_equal(carom.load_recording("again.h5").x, out.x)
+    assert "Wrote 3 trajectories of 8 states" in capsys.readouterr().out
+
+
+def test_bad_arguments_are_one_clear_line(capsys, tmp_path):
+    assert "Did you mean 'cp3'" in refused(capsys, "learn", "cp33")
+    assert "trajectories must be at least 8" in refused(capsys, "learn", "cp3", "--trajectories", 3)
+    assert "resume needs --out" in refused(capsys, "learn", "cp3", "--resume")
+    assert "not a run folder" in refused(capsys, "evaluate", tmp_path)
+    assert "missing.npz" in refused(capsys, "learn", "cp3", "--data", "missing.npz")
+    assert "val needs --data" in refused(capsys, "learn", "cp3", "--val", "val.npz")
+    (tmp_path / "file").write_text("")
+    out = tmp_path / "file" / "run"
+    assert "cannot make the run folder" in refused(capsys, "learn", "cp3", "--out", out, "--trajectories", 8)
+    assert "trajectories must be at least 1" in refused(capsys, "simulate", "cp3", "--trajectories", 0)
+    assert "dt must be a positive" in refused(capsys, "simulate", "cp3", "--dt", 0, "--trajectories", 1)
+    assert "cannot be written" in refused(
+        capsys, "simulate", "cp3", "--trajectories", 1, "--steps", 2, "--out", tmp_path / "no" / "x.h5"
+    )
+    assert not list(tmp_path.glob("**/x.h5"))
+
+
+def test_bad_configurations_are_one_clear_line(capsys):
+    assert "epochs must be at least 1" in refused(capsys, "learn", "cp3", "--epochs", 0)
+    assert "initial_restitution" in refused(capsys, "learn", "cp3", "--initial-restitution", 2)
+
+
+@pytest.mark.parametrize("fault", ["nan", "steps", "task", "points", "wall"])
+def test_bad_recordings_are_one_clear_line(capsys, tmp_path, fault):
+    x = np.zeros((12, 9, 3, 2))
+    x[:, :, :, 1] = [-0.35, -0.75, -1.1] if fault == "wall" else [-0.35, -0.75, -0.8]
+    content = {"x": x, "v": np.zeros_like(x), "time": 0.01 * np.arange(9.0)}
+    if fault == "nan":
+        content["x"][3, 4, 1, 0] = np.nan
+    elif fault == "steps":
+        content["time"][5] += 0.004
+    elif fault == "task":
+        content["task"] = np.array("bp5")
+    elif fault == "points":
+        content["x"], content["v"] = content["x"][:, :, :2], content["v"][:, :, :2]
+    np.savez("bad.npz", **content)
+    message = {
+        "nan": "bad.npz: x",
+        "steps": "bad.npz: time",
+        "task": "another task",
+        "points": "2 points in 2D",
+        "wall": "body 2 in a wall",
+    }
+    assert message[fault] in refused(capsys, "learn", "cp3", "--data", "bad.npz", "--out", "run")
+    assert not (tmp_path / "run" / "model.carom").exists()
+
+
+def test_help_shows_every_default(capsys):
+    with pytest.raises(SystemExit) as stop:
+        command("learn", "--help")
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for option in ("--data", "--resume", "--quick", "--epochs", "--learning-rate", "--model"):
+        assert option in text
+    assert "(default: 250)" in " ".join(text.split())
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.timeout(400)
+def test_a_killed_training_goes_on_where_it_was(tmp_path):
+    run = Path(tmp_path / "run")
+    options = [*TINY, "--out", str(run)]
+    options[options.index("--epochs") + 1] = "40"
+    start = [sys.executable, "-m", "carom.cli.main", "learn", "cp3", *options]
+    environment = {
+        **os.environ,
+        "CAROM_CACHE": str(tmp_path / "cache"),
+        "PYTHONPATH": str(Path(carom.__file__).parents[1]),
+    }
+    process = subprocess.Popen(start, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 240
+    while len(RunFolder(run).metrics()) < 5:
+        assert process.poll() is None, "the training ended by itself"
+        assert time.monotonic() < deadline, "no five epochs within four minutes"
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = RunFolder(run).metrics()[-1]["epoch"]
+    assert done < 40
+    again = subprocess.run([*start, "--resume"], env=environment, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert [m["epoch"] for m in RunFolder(run).metrics()] == list(range(1, 41))
+    other = subprocess.run(
+        [*start, "--resume", "--seed", "5"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert other.returncode == 2
+    assert "was started with seed = 0" in other.stderr
