@@ -48,8 +48,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--slow",
         choices=("none", "ci", "all"),
         default="ci",
-        help="which tests marked slow (over 5 s) to run: none, those also marked ci_budget "
-        "(ci, the default), or all",
+        help="which tests marked slow (over 5 s) to run: none, those also marked ci_budget (ci, the default), or all",
     )
 
 

@@ -44,7 +44,11 @@ def motions(name, count=8):
     if name == "top":
         rotation, omega, _, _ = random_motions(rng, count, 3)
         center = 0.3 * rotation[:, :, 2]
-        return heavy_top(arm=0.3), embed_pose(center, rotation), embed_velocity(rotation, jnp.cross(omega, center), omega)
+        return (
+            heavy_top(arm=0.3),
+            embed_pose(center, rotation),
+            embed_velocity(rotation, jnp.cross(omega, center), omega),
+        )
     dim = {"body 2D": 2, "body 3D": 3}[name]
     return free_body(dim), *random_motions(rng, count, dim)[2:]
 
@@ -55,8 +59,8 @@ NAMES = ("chain", "body 2D", "body 3D", "top")
 def chain_accelerations(angles, spins):
     """Angular accelerations of a chain of pendulums, from its equations of motion in angles.
 
-    `sum_j c_ij l_i l_j (cos(a_i - a_j) a_j'' + sin(a_i - a_j) a_j'^2) + c_ii g l_i sin a_i = 0`, where `c_ij` is the mass
-    that hangs below both joints.
+    `sum_j c_ij l_i l_j (cos(a_i - a_j) a_j'' + sin(a_i - a_j) a_j'^2) + c_ii g l_i sin a_i = 0`, where `c_ij` is the
+    mass that hangs below both joints.
     """
     below = np.cumsum(MASSES[::-1])[::-1]
     c = below[np.maximum.outer(np.arange(3), np.arange(3))] * np.outer(LENGTHS, LENGTHS)
@@ -109,7 +113,9 @@ def test_hamiltonian_positions_obey_the_velocity_constraint_from_anywhere():
     system, x, v = motions("chain")
     wild = v + jnp.asarray(np.random.default_rng(8).standard_normal(v.shape))
     x_rate, _ = rates(system, "hamiltonian", x, wild, None)
-    np.testing.assert_allclose(jax.vmap(jax.jacrev(system.constraints))(x).reshape(-1, 3, 6) @ x_rate.reshape(-1, 6, 1), 0, atol=1e-11)
+    np.testing.assert_allclose(
+        jax.vmap(jax.jacrev(system.constraints))(x).reshape(-1, 3, 6) @ x_rate.reshape(-1, 6, 1), 0, atol=1e-11
+    )
     np.testing.assert_array_equal(rates(system, "lagrangian", x, wild, None)[0], wild)
 
 

@@ -301,7 +301,7 @@ def test_a_path_that_cannot_be_is_named(tmp_path, name):
     with pytest.raises(CaromError, match=r"path must end in .*; it was '.*a.txt'"):
         WRITERS[name](tmp_path / "a.txt")
     (tmp_path / name).mkdir()
-    with pytest.raises(CaromError, match="cannot be written in .*Is a directory"):
+    with pytest.raises(CaromError, match=r"cannot be written in .*Is a directory"):
         WRITERS[name](tmp_path / name)
     assert os.listdir(tmp_path) == [name]
 
@@ -314,7 +314,7 @@ def test_a_failure_leaves_what_was_there(tmp_path, name, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(CaromError, match="cannot be written in .*No space left on device"):
+    with pytest.raises(CaromError, match=r"cannot be written in .*No space left on device"):
         WRITERS[name](tmp_path / name)
     assert os.listdir(tmp_path) == [name]
     assert (tmp_path / name).read_text() == "before"
