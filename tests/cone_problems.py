@@ -263,7 +263,7 @@ def objective(A, v, f):
     return np.sum(0.5 * f * apply(A, f) + f * v, axis=(1, 2))
 
 
-def kkt_residual(A, v, friction, lower, f, reference=None):
+def kkt_residual(A, v, friction, lower, f, reference=None, *, rounded: bool = False):
     """Largest violation of the optimality conditions by `f`, relative to the problem's scales, (B,).
 
     From the data and the impulse alone. With the velocity after, `g = A f + v`, the optimum has
@@ -278,6 +278,9 @@ def kkt_residual(A, v, friction, lower, f, reference=None):
     comparable, whatever the masses. Velocities are then relative to `problem_scale` (or to that of
     `reference`, the velocities before the impact, if larger: of a contact that stuck, compression
     leaves rounding), impulses to that or to the largest impulse, and products to both.
+
+    With `rounded` data, velocities are relative to the largest sum of terms of `A f` too: of a sum of terms that are
+    known to single precision, and cancel, no more can be asked.
     """
     c = contact_scale(A, v.shape[-1])
     present = c > 0
@@ -287,6 +290,7 @@ def kkt_residual(A, v, friction, lower, f, reference=None):
         unit = np.maximum(unit, problem_scale(A, reference, friction, lower))
     unit = np.where(unit > TINY, unit, 1)[:, None, None]
     y, g = f * c / unit, (apply(A, f) + v) / c / unit
+    terms = np.maximum(np.max(apply(np.abs(A), np.abs(f)) / c / unit, axis=(1, 2)), 1)[:, None] if rounded else 1.0
     low = np.maximum(lower, 0) * c[..., 0] / unit[..., 0]
     slip, push = np.linalg.norm(g[..., 1:], axis=-1), np.linalg.norm(y[..., 1:], axis=-1)
     largest = np.maximum(np.max(np.abs(y), axis=(1, 2)), 1)[:, None]
@@ -295,9 +299,9 @@ def kkt_residual(A, v, friction, lower, f, reference=None):
     violations = [
         (push - friction * y[..., 0]) / largest,
         (low - y[..., 0]) / largest,
-        -dual,
-        np.abs((g[..., 0] - w) * y[..., 0] + np.sum(g[..., 1:] * y[..., 1:], axis=-1)) / largest,
-        np.abs(w * (y[..., 0] - low)) / largest,
+        -dual / terms,
+        np.abs((g[..., 0] - w) * y[..., 0] + np.sum(g[..., 1:] * y[..., 1:], axis=-1)) / largest / terms,
+        np.abs(w * (y[..., 0] - low)) / largest / terms,
     ]
     violation = np.max(violations, axis=0)
     # Padding takes no impulse.

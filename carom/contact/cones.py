@@ -228,7 +228,12 @@ def _merit(problem: _Problem, it: _Iterate, smoothing):
     return jnp.maximum(residual, _complementarity(it) - smoothing)
 
 
-def _interior_point_step(problem: _Problem, it: _Iterate, smoothing) -> _Iterate:
+# Mehrotra's second-order term is a guess. Rarely, far from the central path, it leads in circles: an iterate whose
+# last step brought no progress then takes a plain step towards the central path at this fraction of its products.
+_CENTERING = 0.3
+
+
+def _interior_point_step(problem: _Problem, it: _Iterate, smoothing, careful: Bool[Array, " B"]) -> _Iterate:
     scaling = _Scaling.of(it.y, it.z)
     matrix = _NewtonMatrix(problem, it, scaling)
     curvature = it.w / it.u
@@ -244,7 +249,9 @@ def _interior_point_step(problem: _Problem, it: _Iterate, smoothing) -> _Iterate
     affine = newton(jnp.zeros_like(it.y), jnp.zeros_like(it.u))
     length = jnp.minimum(_step_length(it, affine), 1)
     sigma = jnp.maximum(_complementarity(_advance(it, affine, length)) / mean, 0) ** 3
-    center = jnp.maximum(jnp.minimum(sigma, 1) * mean, smoothing)
+    sigma = jnp.where(careful, _CENTERING, jnp.minimum(sigma, 1))
+    center = jnp.maximum(sigma * mean, smoothing)
+    second = jnp.where(careful, jnp.zeros_like(mean), 1)
 
     def scale_inverse(x):  # W^-1 x
         return scaling.restore(scaling.inverse * scaling.rotate(x))
@@ -253,20 +260,47 @@ def _interior_point_step(problem: _Problem, it: _Iterate, smoothing) -> _Iterate
         return scaling.restore(scaling.rotate(x) / scaling.inverse)
 
     identity = jnp.zeros_like(it.y).at[:, 0].set(1)
-    product = _jordan_product(scale_inverse(affine.y), scale(affine.z))
+    product = second * _jordan_product(scale_inverse(affine.y), scale(affine.z))
     correction = scale_inverse(_jordan_divide(scale(it.z), center * identity - product))
-    bound_correction = (center - affine.u * affine.w) / it.u
+    bound_correction = (center - second * affine.u * affine.w) / it.u
     step = newton(correction, bound_correction)
     fraction = 1 - jnp.clip(0.1 * mean, 1e-3, 0.01)
     length = jnp.minimum(fraction * _step_length(it, step), 1)
     return _advance(it, step, length)
 
 
+def _residual(problem: _Problem, y: Array, diagonal: Array | float = 0.0) -> Array:
+    """Violation of the optimality conditions of the problem, with `diagonal` taken away from `Q`, by `y` alone.
+
+    The bound's multiplier is the largest that the dual cone leaves it. Impulses are relative to the largest, velocities
+    to the largest term of `Q y + q`: more cannot be asked of data that are rounded. Rounding does not explain what is
+    above `_GROSS`: that is taken as it is, so that huge impulses do not hide a problem without a solution.
+    """
+    g = _matvec(problem.Q, y) - diagonal * y + problem.q
+    slip, push = jnp.sqrt(_dot(g[:, 1:], g[:, 1:])), jnp.sqrt(_dot(y[:, 1:], y[:, 1:]))
+    free = g[:, 0] - slip
+    w = jnp.maximum(free, 0)
+    above = y[:, 0] - jnp.maximum(problem.lower, 0)
+    impulse = jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
+    velocity = jnp.maximum(jnp.max(_matvec(jnp.abs(problem.Q), jnp.abs(y)), axis=(0, 1)), 1)
+    primal = jnp.maximum(push - y[:, 0], -above) / impulse
+    cone = jnp.abs((g[:, 0] - w) * y[:, 0] + _dot(g[:, 1:], y[:, 1:])) / impulse
+    bound = jnp.abs(w * above) / impulse
+    dual = jnp.max(jnp.stack([-free, cone, bound]), axis=0)
+    gross = jnp.where(dual > _GROSS, dual, 0)
+    return jnp.max(jnp.max(jnp.stack([primal, dual / velocity, gross]), axis=0), axis=0)
+
+
+_GROSS = 1e-3
+
+
 class _Loop(NamedTuple):
     it: _Iterate
     best: _Iterate
     merit: Float[Array, " B"]  # of `best`
-    stalled: Int[Array, " B"]  # iterations since `merit` halved
+    y: Float[Array, "K d B"]  # the impulse that violates the optimality conditions least, and how much
+    residual: Float[Array, " B"]
+    stalled: Int[Array, " B"]  # iterations since `merit` or `residual` halved
     done: Bool[Array, " B"]
     iteration: Int[Array, ""]
 
@@ -280,14 +314,16 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
         return jnp.any(~loop.done) & (loop.iteration < settings.max_iterations)
 
     def body(loop: _Loop):
-        new = _interior_point_step(problem, loop.it, smoothing)
+        new = _interior_point_step(problem, loop.it, smoothing, (loop.stalled >= 3) & (loop.stalled % 4 >= 2))
         merit = _merit(problem, new, smoothing)
+        residual = _residual(problem, new.y)
         # An iterate that rounding has pushed out of the interior has a merit that is not finite (or products
         # that are not positive); its problem stops at the best iterate seen.
         inside = jnp.isfinite(merit) & (jnp.min(_det(new.y), axis=0) > 0) & (jnp.min(_det(new.z), axis=0) > 0)
         move = inside & ~loop.done
         better = move & (merit < loop.merit)
-        halved = merit < 0.5 * loop.merit
+        nearer = move & (residual < loop.residual)
+        halved = (merit < 0.5 * loop.merit) | (residual < 0.5 * loop.residual)
         stalled = jnp.where(halved, 0, loop.stalled + 1)
         # At the level of rounding nothing more is to be had; far from it, redundant contacts may take a while.
         patience = jnp.where(loop.merit <= settings.tolerance * 1e-3, 3, 15)
@@ -295,10 +331,13 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
         done = loop.done | ~inside | (merit <= settings.target) | (stalled >= patience)
         it = jax.tree.map(lambda a, b: jnp.where(move, a, b), new, loop.it)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, loop.best)
-        return _Loop(it, best, merit, stalled, done, loop.iteration + 1)
+        y = jnp.where(nearer, new.y, loop.y)
+        residual = jnp.where(nearer, residual, loop.residual)
+        return _Loop(it, best, merit, y, residual, stalled, done, loop.iteration + 1)
 
-    merit = _merit(problem, start, smoothing)
-    loop = _Loop(start, start, merit, jnp.zeros(batch, int), jnp.zeros(batch, bool), jnp.asarray(0))
+    merit, residual = _merit(problem, start, smoothing), _residual(problem, start.y)
+    zero = jnp.zeros(batch, int)
+    loop = _Loop(start, start, merit, start.y, residual, zero, zero > 0, jnp.asarray(0))
     return jax.lax.while_loop(keep_going, body, loop)
 
 
@@ -364,6 +403,7 @@ class _Sensitivity(NamedTuple):
     """What the derivative needs, batch first."""
 
     regular: Float[Array, "B K d"]  # (f_n, g_t) of the regularised problem, in physical units
+    moved: Float[Array, "B K d"]  # the same less the centre of its proximal term
     inverse: Float[Array, "B n n"]  # (Q + W^-2 + D)^-1, in the units of (f_n, g_t)
     bound: Float[Array, "B K"]  # D
     diagonal: Float[Array, " B"]  # delta
@@ -382,29 +422,75 @@ def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
     identity = jnp.zeros_like(v_last).at[:, 0].set(1)
     start = _Iterate(_add_normal(identity, jnp.maximum(problem.lower, 0)), one, identity, one)
     start = start._replace(u=start.y[:, 0] - problem.lower)
-    loop = _interior_point(problem, start, settings)
-    it = loop.best
-    matrix = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z))
-    # First-order correction for the diagonal: the impulse of the problem as it was given.
-    y = it.y + matrix.solve(scales.regularization * it.y)
+    out = _proximal_point(problem, scales, start, settings)
+    it, y = out.it, out.y
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
     solution = _Internal(
         impulse=jnp.moveaxis(scales.S * scales.unit * y + nan, -1, 0),
-        residual=jnp.where(finite, loop.merit, jnp.inf),
-        iterations=jnp.broadcast_to(loop.iteration, (batch,)),
+        residual=jnp.where(finite, out.residual, jnp.inf),
+        iterations=jnp.broadcast_to(out.iterations, (batch,)),
     )
     if not sensitivity:
         return solution, None
     eye = jnp.broadcast_to(jnp.eye(n, dtype=v.dtype)[..., None], (n, n, batch)).reshape(k, d, n, batch)
+    matrix = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z))
     inverse = matrix.solve(eye).reshape(n, n, batch)
     size = jnp.broadcast_to(scales.size[:, None], (k, d, batch))
     both = size.reshape(n, 1, batch) * size.reshape(1, n, batch)
     return solution, _Sensitivity(
         regular=jnp.moveaxis(size * scales.unit * it.y, -1, 0),
+        moved=jnp.moveaxis(size * scales.unit * (it.y - out.center), -1, 0),
         inverse=jnp.moveaxis(inverse * both, -1, 0),
         bound=(it.w / it.u / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
         diagonal=scales.diagonal,
     )
+
+
+# --- The problem as it was given -------------------------------------------------------------------------------------
+
+
+class _Solved(NamedTuple):
+    it: _Iterate  # of the regularised problem
+    center: Float[Array, "K d B"]  # of its proximal term
+    y: Float[Array, "K d B"]  # the solution, without the diagonal
+    residual: Float[Array, " B"]
+    iterations: Int[Array, ""]
+    rounds: Int[Array, ""]
+
+
+# The diagonal is that of a proximal term delta/2 |f - f_0|^2. With f_0 = 0 it selects the solution of least norm; one
+# Newton step without the diagonal then removes most of its effect on the impulse. Where that is not enough (data in
+# single precision, whose delta is large, with singular A or large impulses) the problem is solved again around the
+# solution found: the proximal-point method (Rockafellar, 1976), which needs two or three rounds.
+_ROUNDS = 5
+
+
+def _proximal_point(problem: _Problem, scales: _Scales, start: _Iterate, settings: ConeSettings) -> _Solved:
+    batch = problem.q.shape[-1]
+    wanted = jnp.maximum(0.1 * settings.tolerance, settings.smoothing).astype(problem.q.dtype)
+
+    def keep_going(best: _Solved):
+        return jnp.any(best.residual > wanted) & (best.rounds < _ROUNDS)
+
+    def body(best: _Solved):
+        center = jnp.where(best.rounds > 0, best.y, 0)
+        loop = _interior_point(problem._replace(q=problem.q - scales.regularization * center), start, settings)
+        it = loop.best
+        matrix = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z))
+        corrected = it.y + matrix.solve(scales.regularization * (it.y - center))
+        plain, better = (_residual(problem, y, scales.regularization) for y in (loop.y, corrected))
+        y = jnp.where(better < plain, corrected, loop.y)
+        residual = jnp.where(better < plain, better, plain)
+        new = (it, center, y, residual)
+        # A problem that is solved well enough stays as it is; so does one that this round made worse.
+        take = (best.residual > wanted) & ((residual < best.residual) | (best.rounds == 0))
+        new = jax.tree.map(lambda a, b: jnp.where(take, a, b), new, tuple(best[:4]))
+        return _Solved(*new, best.iterations + loop.iteration, best.rounds + 1)
+
+    nothing = jnp.zeros_like(start.y)
+    zero = jnp.asarray(0)
+    first = _Solved(start, nothing, nothing, jnp.full(batch, jnp.inf, problem.q.dtype), zero, zero)
+    return jax.lax.while_loop(keep_going, body, first)
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------
@@ -437,6 +523,7 @@ def _solve_batch(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
     if sensitivity:
         extra = _Sensitivity(
             regular=jnp.zeros((batch, k, d), v.dtype),
+            moved=jnp.zeros((batch, k, d), v.dtype),
             inverse=jnp.zeros((batch, n, n), v.dtype),
             bound=jnp.zeros((batch, k), v.dtype),
             diagonal=jnp.zeros(batch, v.dtype),
@@ -522,12 +609,14 @@ def _impulse(A, v, friction, lower, settings: ConeSettings) -> _Internal:
 
 # The derivative. At the solution (or at the point of the central path where `smoothing` ends) the conditions
 #
-#     S (A f + delta f + v) = z + w e_n,   f = S y,   y = (f_n, g_t)
+#     S (A f + delta (f - f_0) + v) = z + w e_n,   f = S y,   y = (f_n, g_t)
 #
 # with z and w eliminated by their linearised complementarity (dz = -W^-2 dy, dw = -D (dy_n - dlower)) give
 #
-#     (Q + W^-2 + D e_n e_n^T) dy = -( dS (A f + delta f + v) + S (dA f + dv + (A + delta) dS y) ) + D e_n dlower
+#     (Q + W^-2 + D e_n e_n^T) dy
+#         = -( dS (A f + delta (f - f_0) + v) + S (dA f + dv + (A + delta) dS y) ) + D e_n dlower
 #
+# with f_0 the centre of the proximal term, zero in the first round
 # (optimality conditions as in Amos and Kolter, OptNet, 2017, eq. 6, for the cones used here). Everything on the right
 # is linear in the tangents and the matrix is the solver's own, so that both modes, vmap and jit follow from this rule.
 @_impulse.defjvp
@@ -536,7 +625,7 @@ def _impulse_jvp(settings, primals, tangents):
     dA, dv, dfriction, dlower = tangents
     solution, out = _batched(settings, True)(*primals)
     f = _friction_scale(out.regular, friction)
-    after = _apply(A, f) + out.diagonal[:, None, None] * f + v
+    after = _apply(A, f) + out.diagonal[:, None, None] * _friction_scale(out.moved, friction) + v
     # Where mu = 0 the tangent g is not determined by the problem. For a growing mu, friction opposes sliding.
     tangent = after[..., 1:]
     norm = jnp.sqrt(jnp.sum(tangent**2, axis=-1, keepdims=True))

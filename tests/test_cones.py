@@ -1,0 +1,170 @@
+"""The friction-cone solver: optimality on random and degenerate problems, derivatives, padding. Arrays only.
+
+`benchmarks/battery.py` does the same on 200,000 problems.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cone_problems import FAMILIES, TINY, clarabel_solution, generate, kkt_residual, objective, problem_scale
+
+import carom
+from carom.contact.cones import solve_cone_problem
+
+SOLVE = jax.jit(solve_cone_problem)
+
+
+def problems_of(family, seed, batch, room, d, **kwargs):
+    p = generate(np.random.default_rng(seed), family, batch, room, d, **kwargs)
+    return p.A, p.v, p.friction, p.lower
+
+
+def solved(arrays, dtype=jnp.float64):
+    """The problems in the precision that the solver gets, and its impulses, as NumPy in double."""
+    arrays = [np.asarray(a, dtype) for a in arrays]
+    f = SOLVE(*map(jnp.asarray, arrays)).impulse
+    assert f.dtype == dtype
+    return [np.asarray(a, np.float64) for a in (*arrays, f)]
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_optimality_on_random_and_degenerate_problems(family, d):
+    """The promises: 1e-8 in double precision, 1e-4 in single, judged from data and impulse alone."""
+    for room, dtype, promise in ((4, jnp.float64, 1e-8), (4, jnp.float32, 1e-4)):
+        *data, f = solved(problems_of(family, 7, 512, room, d), dtype)
+        assert np.isfinite(f).all()
+        assert kkt_residual(*data, f, rounded=dtype == jnp.float32).max() <= promise
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.parametrize("d", [2, 3])
+def test_optimality_with_twenty_contacts(d):
+    for family in FAMILIES:
+        *data, f = solved(problems_of(family, 8, 64, 20, d))
+        assert kkt_residual(*data, f).max() <= 1e-8, family
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_objective_equals_that_of_another_solver(family, d):
+    A, v, friction, lower, f = solved(problems_of(family, 7, 512, 4, d))
+    some = slice(0, 25)
+    A, v, friction, lower, f = (a[some] for a in (A, v, friction, lower, f))
+    _, other, status = zip(*(clarabel_solution(*p) for p in zip(A, v, friction, lower, strict=True)), strict=True)
+    own = objective(A, v, f)
+    scale = np.maximum(problem_scale(A, v, friction, lower) ** 2, np.abs(own))
+    excess = (own - np.array(other)) / np.where(scale > TINY, scale, 1)
+    good = np.isin(status, ["Solved", "AlmostSolved"])
+    assert good.mean() > 0.8
+    assert np.max(excess[good]) < 1e-8
+
+
+def physical_problem(redundant):
+    """Contacts as functions of inverse masses `w` and velocities `u`: `A = J diag(w) J^T`, `v = J u`."""
+    rng = np.random.default_rng(3)
+    J = rng.normal(size=(6, 2, 3, 9))
+    if redundant:
+        J[:, 1] = (
+            J[:, 0] + np.array([0.0, 0.1, 0.0])[:, None] * J[:, 1]
+        )  # two contacts nearly at one place: rank 4 of 6
+        J[:, 1, 0], J[:, 1, 2] = J[:, 0, 0], J[:, 0, 2]
+    u = rng.normal(size=(6, 9))
+    v = np.einsum("bkdi,bi->bkd", J, u)
+    J[:, :, 0] *= -np.sign(v[:, :, 0])[..., None]  # all approach
+    if redundant:
+        J[:, 1, 0] = J[:, 0, 0]
+    rest = rng.uniform(0.2, 0.6, (6, 2)), rng.uniform(0.2, 0.8, (6, 2)), 0.1 * rng.normal(size=(6, 9))
+    weight = rng.normal(size=(6, 2, 3))
+
+    def value(w, u, friction, e, u_star):
+        A = jnp.einsum("bxi,bi,byi->bxy", J.reshape(6, 6, 9), w, J.reshape(6, 6, 9))
+        v, v_star = (jnp.einsum("bkdi,bi->bkd", J, x) for x in (u, u_star))
+        fc, fr = carom.contact_impulse(A, v, friction, e, v_star)
+        change = jnp.einsum("bij,bj->bi", A, (fc + fr).reshape(6, 6)).reshape(6, 2, 3)
+        return jnp.sum(weight * change, axis=(1, 2))
+
+    return jax.jit(value), tuple(map(jnp.asarray, (rng.uniform(0.5, 2, (6, 9)), u, *rest)))
+
+
+@pytest.mark.parametrize("redundant", [False, True], ids=["regular", "redundant"])
+def test_derivatives_agree_with_differences_and_between_modes(redundant):
+    """With respect to all that A, v, friction, restitution and target velocity are made of.
+
+    The kinks, where there is no derivative, are the transitions between sticking, sliding and separating. A problem of
+    the batch that is next to one shows it by one-sided differences that disagree, and is left out; few are.
+    """
+    value, arrays = physical_problem(redundant)
+    rng = np.random.default_rng(4)
+    reverse = jax.jit(jax.grad(lambda *a: value(*a).sum(), argnums=(0, 1, 2, 3, 4)))(*arrays)
+    forward = jax.jit(lambda a, t: jax.jvp(value, a, t)[1])
+    compared = 0
+    for k in range(5):
+        direction = jnp.asarray(rng.normal(size=arrays[k].shape))
+        tangents = tuple(direction if j == k else jnp.zeros_like(a) for j, a in enumerate(arrays))
+        slope = forward(arrays, tangents)
+        back = jnp.sum((reverse[k] * direction).reshape(6, -1), axis=1)
+        assert np.allclose(slope, back, rtol=1e-10, atol=1e-10)
+
+        def moved(h, k=k, direction=direction):
+            return value(*(a + h * direction if j == k else a for j, a in enumerate(arrays)))
+
+        # Steps of 1e-5 leave 1e-10 of curvature and 1e-9 of the solver's own 1e-14.
+        ahead, back = (moved(1e-5) - moved(0.0)) / 1e-5, (moved(0.0) - moved(-1e-5)) / 1e-5
+        smooth = np.abs(ahead - back) < 1e-3 * (1 + np.abs(slope))
+        difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
+        assert np.allclose(slope[smooth], difference[smooth], rtol=1e-5, atol=1e-5)
+        compared += smooth.sum()
+    assert compared >= 27  # of 30
+
+
+def test_values_can_leave_their_ends():
+    """Derivatives at mu = 0 and e = 0 are the one-sided ones: friction, and rebound, that set in.
+
+    A sliding contact has `f_n = (1 + mu slip) / (1 + mu^2)` for an approach of 1 and A = 1: both components change.
+    """
+    A, v, v_star = jnp.eye(2), jnp.array([[-1.0, 2.0]]), jnp.zeros((1, 2))
+
+    def after(friction, e):
+        return v + sum(carom.contact_impulse(A, v, friction, e, v_star))
+
+    slope_mu, slope_e = jax.jacobian(after, argnums=(0, 1))(jnp.zeros(1), jnp.zeros(1))
+    assert np.allclose(slope_mu[0, :, 0], [2, -1], atol=1e-6)
+    assert np.allclose(slope_e[0, :, 0], [1, 0], atol=1e-6)  # e times the approach
+
+
+def test_padding_and_batches_without_contact_are_left_alone():
+    problems = generate(np.random.default_rng(1), "balls, mass ratio 1e4", 8, 2, 2, contacts=2)
+    A, v, friction, lower = problems.A, problems.v, problems.friction, problems.lower
+    alone = carom.solve_impulse(*map(jnp.asarray, (A, v, friction, lower)))
+    wide = np.zeros((8, 12, 12))
+    wide[:, :4, :4] = A
+
+    def pad(x):
+        return jnp.asarray(np.pad(x, ((0, 0), (0, 4)) + ((0, 0),) * (x.ndim - 2)))
+
+    padded = carom.solve_impulse(jnp.asarray(wide), pad(v), pad(friction), pad(lower))
+    assert np.allclose(padded[:, :2], alone, atol=1e-9)
+    assert not padded[:, 2:].any()
+    nothing = SOLVE(jnp.zeros((1000, 4, 4)), *(jnp.zeros((1000, *s)) for s in ((2, 2), (2,), (2,))))
+    assert not nothing.impulse.any()
+    assert not nothing.iterations.any()
+
+
+def test_the_impulse_of_least_norm_is_taken():
+    """Four corners of a box share the load alike, whatever the solver would find first."""
+    J = np.kron(np.ones((4, 1)), np.eye(2))
+    f = carom.solve_impulse(
+        jnp.asarray(J @ J.T), jnp.tile(jnp.array([-1.0, 0.2]), (4, 1)), jnp.full(4, 0.5), jnp.zeros(4)
+    )
+    assert np.allclose(f, np.tile([0.25, -0.05], (4, 1)), atol=1e-6)
+
+
+def test_second_derivatives_say_that_there_are_none():
+    def f(mu):
+        return carom.solve_impulse(jnp.eye(2), jnp.array([[-1.0, 2.0]]), mu, jnp.zeros(1)).sum()
+
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.hessian(f)(jnp.array([0.3]))
