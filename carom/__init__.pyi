@@ -3,8 +3,11 @@
 from .contact.candidates import Contact as Contact
 from .contact.candidates import DiskDisk as DiskDisk
 from .contact.candidates import DiskPlane as DiskPlane
+from .contact.candidates import RimPlane as RimPlane
 from .contact.impulses import contact_impulse as contact_impulse
 from .contact.impulses import solve_impulse as solve_impulse
+from .contact.limits import BendLimit as BendLimit
+from .contact.limits import StretchLimit as StretchLimit
 from .errors import CaromError as CaromError
 from .learning.dataset import Dataset as Dataset
 from .learning.dataset import recording_of as recording_of
@@ -24,6 +27,8 @@ from .mechanics.constraints import Tether as Tether
 from .mechanics.potentials import Gravity as Gravity
 from .mechanics.potentials import NoPotential as NoPotential
 from .mechanics.potentials import Potential as Potential
+from .mechanics.potentials import Springs as Springs
+from .mechanics.potentials import Sum as Sum
 from .simulation.files import Recording as Recording
 from .simulation.files import load_recording as load_recording
 from .simulation.files import save_recording as save_recording

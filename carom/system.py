@@ -29,7 +29,7 @@ class System(eqx.Module):
 
     - `bodies`: `PointMass` and `RigidBody` objects; their points are stacked in this order into `x` (n, d).
     - `constraints`: `Distance`, `Tether`, `Joint` objects between points; a rigid body's own are added.
-    - `contacts`: `DiskDisk`, `DiskPlane` objects.
+    - `contacts`: `DiskDisk`, `DiskPlane`, `RimPlane`, `BendLimit`, `StretchLimit` objects.
     - `potential`: a `Potential`, such as `Gravity((0., -9.81))`; none by default.
     - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers
       to them by its `property` index; a single number is shared by all.
@@ -182,7 +182,7 @@ class System(eqx.Module):
 
     def active(self, x: Float[Array, "n d"]) -> Active:
         """The closed contacts at `x`, deepest first, padded to `max_active`."""
-        return active_set(self.candidates(x), self._property_index(), self.max_active)
+        return active_set(self.candidates(x), self._property_index(), self.max_active, self.n_points)
 
     def gaps(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t C"]:
         """Gap (m) of every candidate; negative where closed."""
@@ -205,8 +205,8 @@ def _dimension(bodies, contacts, potential, dim) -> int:
     if potential.dimension() is not None:
         said["potential"] = potential.dimension()
     for contact in contacts:
-        if hasattr(contact, "normal"):
-            said[type(contact).__name__] = contact.normal.shape[0]
+        if contact.dimension() is not None:
+            said[type(contact).__name__] = contact.dimension()
     for body in bodies:
         if isinstance(body, RigidBody):
             said["RigidBody"] = body.moments.shape[0]

@@ -13,8 +13,8 @@ def property_names(system: System) -> list[str]:
     """What each contact property belongs to, in words."""
     owners: list[list[str]] = [[] for _ in range(system.n_properties)]
     for contact in system.contacts:
-        for bodies, index in zip(contact.bodies_of(), contact.property_index, strict=True):
-            owners[index].append("-".join(map(str, bodies)) + ("-wall" if len(bodies) == 1 else ""))
+        for name, index in zip(contact.names(), contact.property_index, strict=True):
+            owners[index].append(name)
     return [
         names[0] if len(names) == 1 else "all contacts" if len(owners) == 1 else f"{names[0]} ..." for names in owners
     ]

@@ -1,6 +1,7 @@
 """Contact types: from the points of a system to gaps and the contact Jacobian, and the choice of the active ones.
 
-A new contact type is one new class here: `Contact` with its gaps and Jacobian rows.
+A new contact type is one new class: a `Contact` with its gaps and Jacobian rows. Those of chains (bend and stretch
+limits) are in `limits.py`.
 """
 
 import abc
@@ -8,20 +9,26 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, require
-from carom.contact.geometry import Touch, sphere_plane, sphere_sphere
+from carom.contact.geometry import Touch, rim_plane, sphere_plane, sphere_sphere
 from carom.mechanics.bodies import BodyTable
 
 
 class Candidates(NamedTuple):
-    """All contacts that could be: `gap` (C,) in m; Jacobian rows (normal, tangents) to point velocities."""
+    """All contacts that could be: `gap` (C,) in m (or rad), and the Jacobian in its sparse form.
+
+    Candidate c depends on the points `stencil[c]` (P,) alone; `rows[c]` (d, P, d) maps their velocities to the relative
+    velocity in the contact frame (normal, tangents). A point may stand in a stencil more than once: its rows add up.
+    """
 
     gap: Float[Array, " C"]
-    jacobian: Float[Array, "C d n d"]
+    stencil: Int[np.ndarray, "C P"]
+    rows: Float[Array, "C d P d"]
 
 
 class Contact(eqx.Module):
@@ -41,8 +48,17 @@ class Contact(eqx.Module):
     def bodies_of(self) -> tuple[tuple[int, ...], ...]:
         """The bodies of each candidate."""
 
+    @abc.abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """What each candidate is called in tables and messages."""
 
-def _property_indices(name: str, value: int | Sequence[int], count: int) -> tuple[int, ...]:
+    @abc.abstractmethod
+    def dimension(self) -> int | None:
+        """The dimension of space that this family asks for, if it asks for one."""
+
+
+def property_indices(name: str, value: int | Sequence[int], count: int) -> tuple[int, ...]:
+    """The property index of each of `count` contacts of the family `name`."""
     if isinstance(value, int):
         return (value,) * count
     indices = tuple(int(p) for p in value)
@@ -53,9 +69,22 @@ def _property_indices(name: str, value: int | Sequence[int], count: int) -> tupl
     return indices
 
 
-def _jacobian(weights: Float[Array, "c n"], frame: Float[Array, "c d d"]) -> Float[Array, "c d n d"]:
-    """Rows that map point velocities to the relative velocity in the contact frame."""
+def _rows(weights: Float[Array, "c p"], frame: Float[Array, "c d d"]) -> Float[Array, "c d p d"]:
+    """Rows that map point velocities to the velocity of a material point in the contact frame."""
     return weights[:, None, :, None] * frame[:, :, None, :]
+
+
+def plane(name: str, point, normal) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    """`point` and unit `normal` of a plane, checked."""
+    point, normal = as_floats(point), as_floats(normal)
+    length = jnp.linalg.norm(normal)
+    require(
+        point.shape == normal.shape and normal.shape in ((2,), (3,)),
+        f"{name} point and normal must be vectors of 2 or 3 numbers; their shapes were {point.shape} and "
+        f"{normal.shape}.",
+    )
+    require(bool(length > 0), f"{name} normal must not be zero: give the direction out of the solid side.")
+    return point, normal / length
 
 
 class DiskDisk(Contact):
@@ -72,16 +101,17 @@ class DiskDisk(Contact):
         self.pairs = tuple((int(a), int(b)) for a, b in pairs)
         for a, b in self.pairs:
             require(a != b, f"DiskDisk pairs two different bodies; a pair was ({a}, {b}).")
-        self.property_index = _property_indices("DiskDisk", property, len(self.pairs))
+        self.property_index = property_indices("DiskDisk", property, len(self.pairs))
 
     def candidates(self, x, radii, table):
         a, b = np.array(self.pairs).T
         centers = np.array(table.center)
         touch = sphere_sphere(x[centers[a]], x[centers[b]], radii[a], radii[b])
         normal = touch.frame[:, 0]
-        weights = table.weights(x, a, -radii[a][:, None] * normal)
-        weights = weights - table.weights(x, b, radii[b][:, None] * normal)
-        return Candidates(touch.gap, _jacobian(weights, touch.frame))
+        first = _rows(table.weights(x, a, -radii[a][:, None] * normal), touch.frame)
+        second = _rows(table.weights(x, b, radii[b][:, None] * normal), touch.frame)
+        stencil = np.concatenate([table.stencil(a), table.stencil(b)], axis=1)
+        return Candidates(touch.gap, stencil, jnp.concatenate([first, -second], axis=2))
 
     def reach(self, radii):
         a, b = np.array(self.pairs).T
@@ -89,6 +119,12 @@ class DiskDisk(Contact):
 
     def bodies_of(self):
         return self.pairs
+
+    def names(self):
+        return tuple(f"{a}-{b}" for a, b in self.pairs)
+
+    def dimension(self):
+        return None
 
 
 class DiskPlane(Contact):
@@ -105,23 +141,15 @@ class DiskPlane(Contact):
 
     def __init__(self, bodies: Iterable[int], point, normal, property: int | Sequence[int] = 0):
         self.bodies = tuple(int(b) for b in bodies)
-        self.point, normal = as_floats(point), as_floats(normal)
-        length = jnp.linalg.norm(normal)
-        require(
-            self.point.shape == normal.shape and normal.shape in ((2,), (3,)),
-            f"DiskPlane point and normal must be vectors of 2 or 3 numbers; their shapes were {self.point.shape} and "
-            f"{normal.shape}.",
-        )
-        require(bool(length > 0), "DiskPlane normal must not be zero: give the direction out of the solid side.")
-        self.normal = normal / length
-        self.property_index = _property_indices("DiskPlane", property, len(self.bodies))
+        self.point, self.normal = plane("DiskPlane", point, normal)
+        self.property_index = property_indices("DiskPlane", property, len(self.bodies))
 
     def candidates(self, x, radii, table):
         body = np.array(self.bodies)
         centers = np.array(table.center)[body]
         touch: Touch = sphere_plane(x[centers], radii[body], self.point, self.normal)
         weights = table.weights(x, body, -radii[body][:, None] * self.normal)
-        return Candidates(touch.gap, _jacobian(weights, touch.frame))
+        return Candidates(touch.gap, table.stencil(body), _rows(weights, touch.frame))
 
     def reach(self, radii):
         return radii[np.array(self.bodies)]
@@ -129,13 +157,92 @@ class DiskPlane(Contact):
     def bodies_of(self):
         return tuple((b,) for b in self.bodies)
 
+    def names(self):
+        return tuple(f"{b}-wall" for b in self.bodies)
+
+    def dimension(self):
+        return self.normal.shape[0]
+
+
+class RimPlane(Contact):
+    """Contacts between the rims of rigid bodies in 3D and a fixed plane: a gyroscope's wheel, a coin, a wheel.
+
+    The rim is the circle of the body's radius about its centre of mass, at right angles to its third axis. The contact
+    is at the deepest point.
+
+    **Arguments:** `bodies`, which; `point` (3,), on the plane (m); `normal` (3,), out of the solid side, of any length;
+    `angles` (rad), if given: the rim is these points of it alone, by angle from the first axis to the second;
+    `property`, index into the system's `friction` and `restitution`: one for all, or one for each body.
+    """
+
+    bodies: tuple[int, ...] = eqx.field(static=True)
+    point: Float[Array, " 3"]
+    normal: Float[Array, " 3"]
+    angles: tuple[float, ...] | None = eqx.field(static=True)
+    property_index: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        bodies: Iterable[int],
+        point,
+        normal,
+        angles: Sequence[float] | None = None,
+        property: int | Sequence[int] = 0,
+    ):
+        self.bodies = tuple(int(b) for b in bodies)
+        self.point, self.normal = plane("RimPlane", point, normal)
+        require(self.normal.shape == (3,), f"RimPlane normal must have 3 numbers; it had {self.normal.shape[0]}.")
+        self.angles = None if angles is None else tuple(float(a) for a in angles)
+        require(self.angles is None or len(self.angles) > 0, "RimPlane angles must name at least one point of the rim.")
+        self.property_index = property_indices("RimPlane", property, len(self.bodies))
+
+    def candidates(self, x, radii, table):
+        body = np.array(self.bodies)
+        stencil = table.stencil(body)
+        center = x[stencil[:, 0]]
+        axes = x[stencil[:, 1:]] - center[:, None]
+        if self.angles is None:
+            touch, offset = rim_plane(center, axes[:, 2], radii[body], self.point, self.normal)
+        else:
+            circle = np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1)
+            rim = radii[body][:, None, None] * jnp.einsum("ka,cad->ckd", circle.astype(x.dtype), axes[:, :2])
+            deepest = jnp.argmin(rim @ self.normal, axis=1)
+            offset = jnp.take_along_axis(rim, deepest[:, None, None], axis=1)[:, 0]
+            touch = sphere_plane(center + offset, jnp.zeros_like(radii[body]), self.point, self.normal)
+        return Candidates(touch.gap, stencil, _rows(table.weights(x, body, offset), touch.frame))
+
+    def reach(self, radii):
+        return 2 * radii[np.array(self.bodies)]
+
+    def bodies_of(self):
+        return tuple((b,) for b in self.bodies)
+
+    def names(self):
+        return tuple(f"{b}-wall" for b in self.bodies)
+
+    def dimension(self):
+        return 3
+
 
 def all_candidates(
     contacts: Sequence[Contact], x: Float[Array, "n d"], radii: Float[Array, " bodies"], table: BodyTable
 ) -> Candidates:
-    """The candidates of all contact families, in order."""
+    """The candidates of all contact families, in order, with stencils of one width."""
     parts = [contact.candidates(x, radii, table) for contact in contacts]
-    return Candidates(jnp.concatenate([p.gap for p in parts]), jnp.concatenate([p.jacobian for p in parts]))
+    width = max(p.stencil.shape[1] for p in parts)
+
+    def widen(part: Candidates) -> Candidates:
+        # A stencil is filled up with its first point, whose added rows are zero.
+        more = width - part.stencil.shape[1]
+        stencil = np.concatenate([part.stencil, np.repeat(part.stencil[:, :1], more, axis=1)], axis=1)
+        return Candidates(part.gap, stencil, jnp.pad(part.rows, ((0, 0), (0, 0), (0, more), (0, 0))))
+
+    parts = [widen(p) for p in parts]
+    return Candidates(
+        jnp.concatenate([p.gap for p in parts]),
+        np.concatenate([p.stencil for p in parts]),
+        jnp.concatenate([p.rows for p in parts]),
+    )
 
 
 class Active(NamedTuple):
@@ -148,18 +255,25 @@ class Active(NamedTuple):
     gap: Float[Array, " K"]
     jacobian: Float[Array, "K d n d"]
     property_index: Int[Array, " K"]
+    closed: Bool[Array, " C"]  # which of all candidates these are
     overflow: Int[Array, ""]
 
 
-def active_set(candidates: Candidates, property_index: Int[np.ndarray, " C"], max_active: int) -> Active:
-    """Choose the closed contacts (`gap < 0`), deepest first; Jacobian rows of the others are zero."""
+def active_set(candidates: Candidates, property_index: Int[np.ndarray, " C"], max_active: int, n_points: int) -> Active:
+    """Choose the closed contacts (`gap < 0`), deepest first; Jacobian rows of the others are zero.
+
+    Only the chosen contacts get a full Jacobian: candidates may be many.
+    """
     closed = candidates.gap < 0
     order = jnp.argsort(candidates.gap)[:max_active]
     active = closed[order]
+    rows = jnp.where(active[:, None, None, None], candidates.rows[order], 0)
+    points = jax.nn.one_hot(jnp.asarray(candidates.stencil)[order], n_points, dtype=rows.dtype)
     return Active(
         active=active,
         gap=candidates.gap[order],
-        jacobian=jnp.where(active[:, None, None, None], candidates.jacobian[order], 0),
+        jacobian=jnp.einsum("kipj,kpn->kinj", rows, points),
         property_index=jnp.asarray(property_index)[order],
+        closed=jnp.zeros(closed.shape[0], bool).at[order].set(active),
         overflow=jnp.maximum(jnp.sum(closed) - max_active, 0),
     )

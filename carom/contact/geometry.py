@@ -52,3 +52,45 @@ def sphere_plane(
     """A disk (2D) or sphere (3D) and the half-space behind a plane through `point` with unit `normal`."""
     gap = (center - point) @ normal - radius
     return Touch(gap, contact_frame(jnp.broadcast_to(normal, center.shape)))
+
+
+def rim_plane(
+    center: Float[Array, "c d"],
+    axis: Float[Array, "c d"],
+    radius: Float[Array, " c"],
+    point: Float[Array, " d"],
+    normal: Float[Array, " d"],
+) -> tuple[Touch, Float[Array, "c d"]]:
+    """A circle about `center`, at right angles to the unit vector `axis`, and a half-space; also the offset from the
+    centre to the deepest point of the circle: `-r (N - (N.a) a) / |N - (N.a) a|`.
+
+    Where the circle is parallel to the plane all of it is equally deep, and the offset is zero: the centre is taken.
+    """
+    across = normal - (axis @ normal)[:, None] * axis
+    square = jnp.sum(across**2, axis=1)
+    tilted = square > jnp.finfo(center.dtype).eps ** 2
+    length = jnp.sqrt(jnp.where(tilted, square, 1))
+    offset = jnp.where(tilted[:, None], -radius[:, None] * across / length[:, None], 0)
+    gap = (center + offset - point) @ normal
+    return Touch(gap, contact_frame(jnp.broadcast_to(normal, center.shape))), offset
+
+
+def wrap_angle(angle: Float[Array, "*c"]) -> Float[Array, "*c"]:
+    """The same angle in (-pi, pi] (rad)."""
+    return angle - 2 * jnp.pi * jnp.ceil((angle - jnp.pi) / (2 * jnp.pi))
+
+
+def bend_gap(chain: Float[Array, "3 2"], limit: Float[Array, ""]) -> Float[Array, ""]:
+    """How much more (rad) the two segments between three points may bend: `limit - |difference of their angles|`.
+
+    The angle of a segment is that from the downward vertical, `atan2(x, -y)`.
+    """
+    segment = chain[1:] - chain[:-1]
+    angle = jnp.arctan2(segment[:, 0], -segment[:, 1])
+    return limit - jnp.abs(wrap_angle(angle[1] - angle[0]))
+
+
+def stretch_gap(ends: Float[Array, "2 d"], shortest: Float[Array, ""], longest: Float[Array, ""]) -> Float[Array, ""]:
+    """How much (m) a segment is away from the nearer of its length limits."""
+    length = jnp.linalg.norm(ends[1] - ends[0])
+    return jnp.minimum(length - shortest, longest - length)

@@ -109,20 +109,31 @@ class BodyTable(eqx.Module):
             n += count
         return cls(dim, tuple(center), tuple(axes), n)
 
-    def weights(
-        self, x: Float[Array, "n d"], body: Int[np.ndarray, " c"], offset: Float[Array, "c d"]
-    ) -> Float[Array, "c n"]:
-        """Barycentric weights of material points: where they are, `weights @ x`; how fast, `weights @ v`.
+    def stencil(self, body: Int[np.ndarray, " c"]) -> Int[np.ndarray, "c p"]:
+        """The points that a material point of each body depends on: its centre, then the ends of its axes.
 
-        `offset` (c, d) leads from the centre of body `body[k]` to the point (m, world frame). The weights of a rigid
-        body's points are the point's coordinates in the body frame; a point mass carries its offset along.
+        One point (p = 1) where none of the bodies can turn; a point mass among rigid bodies repeats its centre.
         """
         center, axes = np.array(self.center)[body], np.array(self.axes)[body]
-        local = jnp.sum(offset[:, None] * (x[axes] - x[center][:, None]), axis=-1)  # (c, d)
-        rows = np.arange(len(body))
-        weights = jnp.zeros((len(body), self.n_points), x.dtype)
-        weights = weights.at[rows, center].add(1 - jnp.sum(local, axis=-1))
-        return weights.at[rows[:, None], axes].add(local)
+        if (axes == center[:, None]).all():
+            return center[:, None]
+        return np.concatenate([center[:, None], axes], axis=1)
+
+    def weights(
+        self, x: Float[Array, "n d"], body: Int[np.ndarray, " c"], offset: Float[Array, "c d"]
+    ) -> Float[Array, "c p"]:
+        """Barycentric weights of material points over their `stencil`: `sum_p w_p x_p` is where they are.
+
+        The same sum of velocities is how fast they are. `offset` (c, d) leads from the centre of body `body[k]` to the
+        point (m, world frame). The weights of a rigid body's points are the point's coordinates in the body frame; a
+        point mass carries its offset along.
+        """
+        points = self.stencil(body)
+        if points.shape[1] == 1:
+            return jnp.ones(points.shape, x.dtype)
+        axes = x[points[:, 1:]] - x[points[:, :1]]
+        local = jnp.sum(offset[:, None] * axes, axis=-1)  # (c, d)
+        return jnp.concatenate([1 - jnp.sum(local, axis=1, keepdims=True), local], axis=1)
 
 
 def embed_pose(position: Float[Array, "*b d"], rotation: Float[Array, "*b d d"]) -> Float[Array, "*b p d"]:

@@ -1,12 +1,13 @@
 """Potential energies: the interface, which learned potentials implement too, and the given ones."""
 
 import abc
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from carom.checks import as_floats, require
+from carom.checks import as_floats, require, require_values
 
 
 class Potential(eqx.Module):
@@ -26,6 +27,55 @@ class NoPotential(Potential):
 
     def __call__(self, x, mass_matrix):
         return jnp.zeros((), x.dtype)
+
+
+class Sum(Potential):
+    """Several potentials at once: `V = sum_k V_k`."""
+
+    parts: tuple[Potential, ...]
+
+    def __init__(self, *parts: Potential):
+        self.parts = parts
+
+    def __call__(self, x, mass_matrix):
+        return sum((part(x, mass_matrix) for part in self.parts), jnp.zeros((), x.dtype))
+
+    def dimension(self):
+        return next((d for part in self.parts if (d := part.dimension()) is not None), None)
+
+
+class Springs(Potential):
+    """Springs along a row of points: `V = sum k (l - l_0)^2` (paper, appendix H; no factor of one half).
+
+    **Arguments:** `points`, indices in order; `stiffness` k (J/m^2); `rest_length` l_0 (m); `anchor` (d,), a fixed point
+    (m) that the first point hangs from by a spring of its own, or `None`.
+    """
+
+    points: tuple[int, ...] = eqx.field(static=True)
+    stiffness: Float[Array, ""]
+    rest_length: Float[Array, ""]
+    anchor: Float[Array, " d"] | None
+
+    def __init__(self, points: Sequence[int], stiffness, rest_length, anchor=None):
+        self.points = tuple(int(p) for p in points)
+        self.stiffness, self.rest_length = as_floats(stiffness), as_floats(rest_length)
+        self.anchor = None if anchor is None else as_floats(anchor)
+        require(
+            len(self.points) + (anchor is not None) >= 2,
+            f"points must name at least two ends of springs, the anchor included; they were {self.points}.",
+        )
+        require_values("stiffness", stiffness, self.stiffness >= 0, "zero or a positive number of J/m^2")
+        require_values("rest_length", rest_length, self.rest_length >= 0, "zero or a positive number of metres")
+
+    def __call__(self, x, mass_matrix):
+        row = x[jnp.array(self.points)]
+        if self.anchor is not None:
+            row = jnp.concatenate([self.anchor.astype(x.dtype)[None], row])
+        length = jnp.linalg.norm(row[1:] - row[:-1], axis=1)
+        return self.stiffness.astype(x.dtype) * jnp.sum((length - self.rest_length.astype(x.dtype)) ** 2)
+
+    def dimension(self):
+        return None if self.anchor is None else self.anchor.shape[0]
 
 
 class Gravity(Potential):

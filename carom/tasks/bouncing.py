@@ -18,7 +18,7 @@ BOX_WALLS = (((0.0, 0.0), (1.0, 0.0)), ((1.0, 0.0), (-1.0, 0.0)), ((0.0, 0.0), (
 def box_contacts(n: int, *, individual: bool) -> list[Contact]:
     """All pairs of `n` bodies, and each body with each wall; one shared property, or individual ones."""
     pairs = list(combinations(range(n), 2))
-    contacts: list[Contact] = [DiskDisk(pairs, property=range(len(pairs)) if individual else 0)]
+    contacts: list[Contact] = [DiskDisk(pairs, property=range(len(pairs)) if individual else 0)] if pairs else []
     for k, (point, normal) in enumerate(BOX_WALLS):
         first = len(pairs) + k * n
         contacts.append(DiskPlane(range(n), point, normal, property=range(first, first + n) if individual else 0))
