@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, require
-from carom.contact.geometry import Touch, rim_plane, sphere_plane, sphere_sphere
+from carom.contact.geometry import Touch, deepest_direction, sphere_plane, sphere_sphere
 from carom.mechanics.bodies import BodyTable
 
 
@@ -202,14 +202,17 @@ class RimPlane(Contact):
         center = x[stencil[:, 0]]
         axes = x[stencil[:, 1:]] - center[:, None]
         if self.angles is None:
-            touch, offset = rim_plane(center, axes[:, 2], radii[body], self.point, self.normal)
+            direction = deepest_direction(axes[:, :2], self.normal)
         else:
-            circle = np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1)
-            rim = radii[body][:, None, None] * jnp.einsum("ka,cad->ckd", circle.astype(x.dtype), axes[:, :2])
-            deepest = jnp.argmin(rim @ self.normal, axis=1)
-            offset = jnp.take_along_axis(rim, deepest[:, None, None], axis=1)[:, 0]
-            touch = sphere_plane(center + offset, jnp.zeros_like(radii[body]), self.point, self.normal)
-        return Candidates(touch.gap, stencil, _rows(table.weights(x, body, offset), touch.frame))
+            rim = np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1).astype(x.dtype)
+            heights = jnp.einsum("ka,cad,d->ck", rim, axes[:, :2], self.normal)
+            direction = jnp.asarray(rim)[jnp.argmin(heights, axis=1)]
+        # Coordinates in the body frame, so that the point is the same material point where the axes have drifted.
+        local = radii[body][:, None] * jnp.concatenate([direction, jnp.zeros_like(direction[:, :1])], axis=1)
+        touching = center + jnp.einsum("ca,cad->cd", local, axes)
+        touch = sphere_plane(touching, jnp.zeros_like(radii[body]), self.point, self.normal)
+        weights = jnp.concatenate([1 - jnp.sum(local, axis=1, keepdims=True), local], axis=1)
+        return Candidates(touch.gap, stencil, _rows(weights, touch.frame))
 
     def reach(self, radii):
         return 2 * radii[np.array(self.bodies)]

@@ -54,25 +54,16 @@ def sphere_plane(
     return Touch(gap, contact_frame(jnp.broadcast_to(normal, center.shape)))
 
 
-def rim_plane(
-    center: Float[Array, "c d"],
-    axis: Float[Array, "c d"],
-    radius: Float[Array, " c"],
-    point: Float[Array, " d"],
-    normal: Float[Array, " d"],
-) -> tuple[Touch, Float[Array, "c d"]]:
-    """A circle about `center`, at right angles to the unit vector `axis`, and a half-space; also the offset from the
-    centre to the deepest point of the circle: `-r (N - (N.a) a) / |N - (N.a) a|`.
+def deepest_direction(axes: Float[Array, "c 2 3"], normal: Float[Array, " 3"]) -> Float[Array, "c 2"]:
+    """The direction in the plane of two axes, by its coordinates, that leads deepest against a plane's `normal`.
 
-    Where the circle is parallel to the plane all of it is equally deep, and the offset is zero: the centre is taken.
+    `-(N.a_1, N.a_2) / |(N.a_1, N.a_2)|`. Where the planes are parallel all directions are equally deep, and none is
+    taken: zero.
     """
-    across = normal - (axis @ normal)[:, None] * axis
-    square = jnp.sum(across**2, axis=1)
-    tilted = square > jnp.finfo(center.dtype).eps ** 2
-    length = jnp.sqrt(jnp.where(tilted, square, 1))
-    offset = jnp.where(tilted[:, None], -radius[:, None] * across / length[:, None], 0)
-    gap = (center + offset - point) @ normal
-    return Touch(gap, contact_frame(jnp.broadcast_to(normal, center.shape))), offset
+    height = axes @ normal
+    square = jnp.sum(height**2, axis=1, keepdims=True)
+    tilted = square > jnp.finfo(height.dtype).eps ** 2
+    return jnp.where(tilted, -height / jnp.sqrt(jnp.where(tilted, square, 1)), 0)
 
 
 def wrap_angle(angle: Float[Array, "*c"]) -> Float[Array, "*c"]:

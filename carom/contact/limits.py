@@ -31,7 +31,7 @@ class Chain(eqx.Module):
         self.anchor = None if anchor is None else as_floats(anchor)
         require(
             self.anchor is None or self.anchor.shape == (2,),
-            f"anchor must be a point of 2 numbers, or None; its shape was {None if anchor is None else np.shape(anchor)}.",
+            "anchor must be a point of 2 numbers, or None; it was of another shape.",
         )
 
     def windows(self, length: int) -> Int[np.ndarray, "c length"]:
@@ -97,8 +97,8 @@ class BendLimit(Contact):
 class StretchLimit(Contact):
     """The segments of a chain stay between two lengths; gaps in m.
 
-    **Arguments:** `bodies`, the chain of point masses; `shortest`, `longest` (m), 0 < shortest < longest; `anchor` (2,), a
-    fixed point that the chain hangs from (m), or `None`; `property`, index into the system's `friction` and
+    **Arguments:** `bodies`, the chain of point masses; `shortest`, `longest` (m), 0 < shortest < longest; `anchor`
+    (2,), a fixed point that the chain hangs from (m), or `None`; `property`, index into the system's `friction` and
     `restitution`: one for all, or one for each segment.
     """
 

@@ -125,15 +125,27 @@ class BodyTable(eqx.Module):
         """Barycentric weights of material points over their `stencil`: `sum_p w_p x_p` is where they are.
 
         The same sum of velocities is how fast they are. `offset` (c, d) leads from the centre of body `body[k]` to the
-        point (m, world frame). The weights of a rigid body's points are the point's coordinates in the body frame; a
-        point mass carries its offset along.
+        point (m, world frame). A rigid body's weights are the point's coordinates in the frame of its axes; a point
+        mass carries its offset along.
         """
         points = self.stencil(body)
         if points.shape[1] == 1:
             return jnp.ones(points.shape, x.dtype)
-        axes = x[points[:, 1:]] - x[points[:, :1]]
-        local = jnp.sum(offset[:, None] * axes, axis=-1)  # (c, d)
+        turns = points[:, 1] != points[:, 0]
+        axes = jnp.where(turns[:, None, None], x[points[:, 1:]] - x[points[:, :1]], jnp.eye(self.dim, dtype=x.dtype))
+        local = jnp.where(turns[:, None], _coordinates(axes, offset), 0)  # (c, d)
         return jnp.concatenate([1 - jnp.sum(local, axis=1, keepdims=True), local], axis=1)
+
+
+def _coordinates(axes: Float[Array, "c d d"], offset: Float[Array, "c d"]) -> Float[Array, "c d"]:
+    """The `a` with `sum_i a_i axes_i = offset`, by Cramer's rule: exact also where axes have drifted from unit ones."""
+    if axes.shape[-1] == 2:
+        (ax, ay), (bx, by) = (axes[:, i].T for i in range(2))
+        numerators = jnp.stack([offset[:, 0] * by - offset[:, 1] * bx, ax * offset[:, 1] - ay * offset[:, 0]], axis=1)
+        return numerators / (ax * by - ay * bx)[:, None]
+    normals = jnp.stack([jnp.cross(axes[:, (i + 1) % 3], axes[:, (i + 2) % 3]) for i in range(3)], axis=1)
+    volume = jnp.sum(axes[:, 0] * normals[:, 0], axis=1)
+    return jnp.sum(normals * offset[:, None], axis=2) / volume[:, None]
 
 
 def embed_pose(position: Float[Array, "*b d"], rotation: Float[Array, "*b d d"]) -> Float[Array, "*b p d"]:

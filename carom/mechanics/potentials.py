@@ -47,8 +47,8 @@ class Sum(Potential):
 class Springs(Potential):
     """Springs along a row of points: `V = sum k (l - l_0)^2` (paper, appendix H; no factor of one half).
 
-    **Arguments:** `points`, indices in order; `stiffness` k (J/m^2); `rest_length` l_0 (m); `anchor` (d,), a fixed point
-    (m) that the first point hangs from by a spring of its own, or `None`.
+    **Arguments:** `points`, indices in order; `stiffness` k (J/m^2); `rest_length` l_0 (m); `anchor` (d,), a fixed
+    point (m) that the first point hangs from by a spring of its own, or `None`.
     """
 
     points: tuple[int, ...] = eqx.field(static=True)

@@ -61,8 +61,8 @@ class BouncingDisks(Task):
 class Billiards(Task):
     """A cue ball that runs into a triangle of ten balls on a table without cushions. Balls do not rotate.
 
-    `sample` puts the cue ball at (0.1, 0.5) m, up to 0.02 m to either side, with a velocity of (0.3, 0) m/s and a normal
-    deviation of 0.02 m/s.
+    `sample` puts the cue ball at (0.1, 0.5) m, up to 0.02 m to either side, with a velocity of (0.3, 0) m/s and a
+    normal deviation of 0.02 m/s.
     """
 
     name: str
