@@ -232,9 +232,9 @@ def _merit(problem: _Problem, it: _Iterate, smoothing):
     return jnp.max(jnp.concatenate(parts, axis=1), axis=(0, 1))
 
 
-# Mehrotra's second-order term is a guess. Rarely, far from the central path, it leads in circles: an iterate whose
-# last step brought no progress then takes a plain step towards the central path at this fraction of its products.
-_CENTERING = 0.3
+# Mehrotra's second-order term is a guess. Far from the central path it may lead in circles: where two steps have brought
+# no progress, the next two go back towards the central path, at this fraction of the products, and without the term.
+_CENTERING = 0.8
 
 
 def _interior_point_step(problem: _Problem, it: _Iterate, smoothing, careful: Bool[Array, " B"]) -> _Iterate:
@@ -373,7 +373,7 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
         return jnp.any(~loop.done) & (loop.iteration < settings.max_iterations)
 
     def body(loop: _Loop):
-        new = _interior_point_step(problem, loop.it, smoothing, (loop.stalled >= 3) & (loop.stalled % 4 >= 2))
+        new = _interior_point_step(problem, loop.it, smoothing, (loop.stalled >= 2) & (loop.stalled % 3 >= 1))
         merit = _merit(problem, new, smoothing)
         residual = _residual(problem, new.y)
         # An iterate that rounding has pushed out of the interior has a merit that is not finite (or products
