@@ -232,9 +232,11 @@ def _merit(problem: _Problem, it: _Iterate, smoothing):
     return jnp.max(jnp.concatenate(parts, axis=1), axis=(0, 1))
 
 
-# Mehrotra's second-order term is a guess. Far from the central path it may lead in circles: where two steps have brought
-# no progress, the next two go back towards the central path, at this fraction of the products, and without the term.
+# Mehrotra's second-order term is a guess. Far from the central path it may lead in circles: where two steps brought no
+# progress, the next two go back towards the central path, at this fraction of the products, and without the term.
 _CENTERING = 0.8
+# How much of the way to the boundary a step may go. More leaves the central path behind, and costs iterations in 3D.
+_FRACTION = 0.95
 
 
 def _interior_point_step(problem: _Problem, it: _Iterate, smoothing, careful: Bool[Array, " B"]) -> _Iterate:
@@ -268,8 +270,7 @@ def _interior_point_step(problem: _Problem, it: _Iterate, smoothing, careful: Bo
     correction = scale_inverse(_jordan_divide(scale(it.z), center * identity - product))
     bound_correction = (center - second * affine.u * affine.w) / it.u
     step = newton(correction, bound_correction)
-    fraction = 1 - jnp.clip(0.1 * mean, 1e-3, 0.01)
-    length = jnp.minimum(fraction * _step_length(it, step), 1)
+    length = jnp.minimum(_FRACTION * _step_length(it, step), 1)
     return _advance(it, step, length)
 
 
@@ -345,7 +346,7 @@ class _ActiveSet(NamedTuple):
         holds = w > u
         rhs = _add_normal(pull - g, jnp.where(holds, w - _HELD * u, 0))
         scaling = _Scaling(direction, jnp.sqrt(curvature[:, : y.shape[1]]))
-        return cls(scaling, jnp.where(holds | (apex & (u < _NEAR_APEX)), _HELD, 0), rhs)
+        return cls(scaling, jnp.where(holds | (apex & (y[:, 0] < _NEAR_APEX)), _HELD, 0), rhs)
 
 
 _TINY = 1e-30
@@ -364,8 +365,10 @@ class _Loop(NamedTuple):
     iteration: Int[Array, ""]
 
 
-def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) -> _Loop:
-    """Iterate until every problem of the batch has met `target`, or stopped improving."""
+def _interior_point(
+    problem: _Problem, start: _Iterate, solved: Bool[Array, " B"], target: Array, settings: ConeSettings
+) -> _Loop:
+    """Iterate until every problem of the batch that is not `solved` has met `target`, or stopped improving."""
     smoothing = jnp.asarray(settings.smoothing, problem.q.dtype)
     batch = problem.q.shape[-1]
 
@@ -385,9 +388,9 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
         halved = (merit < 0.5 * loop.merit) | (residual < 0.5 * loop.residual)
         stalled = jnp.where(halved, 0, loop.stalled + 1)
         # At the level of rounding nothing more is to be had; far from it, redundant contacts may take a while.
-        patience = jnp.where(loop.merit <= 10 * settings.target, 3, 15)
+        patience = jnp.where(loop.merit <= 10 * target, 3, 25)
         merit = jnp.where(better, merit, loop.merit)
-        done = loop.done | ~inside | (merit <= settings.target) | (stalled >= patience)
+        done = loop.done | ~inside | (merit <= target) | (stalled >= patience)
         it = jax.tree.map(lambda a, b: jnp.where(move, a, b), new, loop.it)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, loop.best)
         y = jnp.where(nearer, new.y, loop.y)
@@ -396,7 +399,7 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
 
     merit, residual = _merit(problem, start, smoothing), _residual(problem, start.y)
     zero = jnp.zeros(batch, int)
-    loop = _Loop(start, start, merit, start.y, residual, zero, zero > 0, jnp.asarray(0))
+    loop = _Loop(start, start, merit, start.y, residual, zero, solved, jnp.asarray(0))
     return jax.lax.while_loop(keep_going, body, loop)
 
 
@@ -436,19 +439,18 @@ def _scale(
     Q = S[:, :, None, None] * A * S[None, None]
     Q = Q.at[index[:, None], jnp.arange(d), index[:, None], jnp.arange(d)].add(regularization + floor)
     q = S * v
-    bounded = present & (lower > -jnp.inf)
+    # A bound of zero is none: the cone has it. It matters for the derivative alone.
+    apex, bounded = present & (lower == 0), present & (lower > 0)
     lower = jnp.where(bounded, lower / jnp.where(present, size, 1), 0)
     largest = jnp.maximum(jnp.max(jnp.abs(q), axis=(0, 1)), jnp.max(lower, axis=0))
     largest = jnp.maximum(largest, jnp.max(jnp.abs(S * reference), axis=(0, 1)))
     unit = jnp.maximum(largest, jnp.finfo(dtype).tiny ** 0.5)
     q = jnp.where(present[:, None], q / unit, jnp.zeros_like(q).at[:, 0].set(1))
-    lower = jnp.where(bounded, jnp.maximum(lower / unit, _LIFT), _NO_BOUND)
+    lower = jnp.where(bounded, lower / unit, _NO_BOUND)
     problem = _Problem(Q.reshape(k * d, k * d, batch), q, lower)
-    return problem, _Scales(S, size, unit, diagonal, regularization, bounded & (lower <= _LIFT))
+    return problem, _Scales(S, size, unit, diagonal, regularization, apex)
 
 
-# A bound at the cone's apex (lower = 0) is lifted by this fraction of the problem's scale, into the cone.
-_LIFT = 1e-10
 # Where there is no bound, that of the scaled problem is here: the cone keeps the impulse away from it.
 _NO_BOUND = -1.0
 
@@ -518,7 +520,7 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
 
 
 class _Solved(NamedTuple):
-    it: _Iterate  # the last of the regularised problem
+    it: _Iterate  # the best of the regularised problem
     regular: Float[Array, "K d B"]  # the solution of the regularised problem
     center: Float[Array, "K d B"]  # of its proximal term
     y: Float[Array, "K d B"]  # the solution, without the diagonal
@@ -528,26 +530,35 @@ class _Solved(NamedTuple):
 
 
 # The diagonal is that of a proximal term delta/2 |f - f_0|^2. With f_0 = 0 it selects the solution of least norm; one
-# Newton step without the diagonal then removes most of its effect on the impulse. Where that is not enough (data in
-# single precision, whose delta is large, with singular A or large impulses) the problem is solved again around the
-# solution found: the proximal-point method (Rockafellar, 1976), which needs two or three rounds.
-_ROUNDS = 5
+# Newton step without the diagonal then removes most of its effect on the impulse.
+#
+# Round 0 goes only so far along the central path that the active set can be seen; the step onto it mostly is the end.
+# What is not solved then goes on along the path in round 1. Where that is not enough (data in single precision, whose
+# delta is large, with singular A or large impulses), the problem is solved again around the solution found: the
+# proximal-point method (Rockafellar, 1976), which needs two or three rounds.
+_COARSE = 1e-5
+_ROUNDS = 6
 
 
 def _proximal_point(problem: _Problem, scales: _Scales, start: _Iterate, settings: ConeSettings) -> _Solved:
     batch = problem.q.shape[-1]
-    wanted = jnp.maximum(0.1 * settings.tolerance, settings.smoothing).astype(problem.q.dtype)
+    smooth = settings.smoothing > 0
+    wanted = jnp.asarray(0.1 * settings.tolerance, problem.q.dtype)
 
     def keep_going(best: _Solved):
-        return jnp.any(best.residual > wanted) & (best.rounds < _ROUNDS)
+        return jnp.any(best.residual > wanted) & (best.rounds < (1 if smooth else _ROUNDS))
 
     def body(best: _Solved):
-        center = jnp.where(best.rounds > 0, best.y, 0)
+        again = best.rounds > 1
+        center = jnp.where(again, best.y, 0)
         proximal = problem._replace(q=problem.q - scales.regularization * center)
-        loop = _interior_point(proximal, start, settings)
-        if settings.smoothing > 0:
+        first = jax.tree.map(lambda a, b: jnp.where(again, a, b), start, best.it)
+        coarse = (best.rounds == 0) & (not smooth)
+        target = jnp.where(coarse, jnp.maximum(_COARSE, settings.target), settings.target)
+        loop = _interior_point(proximal, first, best.residual <= wanted, target, settings)
+        if smooth:
             regular = y = loop.best.y
-            residual = jnp.maximum(loop.merit - settings.smoothing, 0)
+            residual = jnp.maximum(loop.merit, 0)
         else:
             regular, y, residual = _finish(problem, proximal, scales, loop, center, wanted)
         new = (loop.best, regular, center, y, residual)
