@@ -536,7 +536,7 @@ class _Solved(NamedTuple):
 # What is not solved then goes on along the path in round 1. Where that is not enough (data in single precision, whose
 # delta is large, with singular A or large impulses), the problem is solved again around the solution found: the
 # proximal-point method (Rockafellar, 1976), which needs two or three rounds.
-_COARSE = 1e-5
+_COARSE = 1e-6
 _ROUNDS = 6
 
 
@@ -573,27 +573,52 @@ def _proximal_point(problem: _Problem, scales: _Scales, start: _Iterate, setting
     return jax.lax.while_loop(keep_going, body, first)
 
 
+# Newton steps onto the active set: each squares the error that the central path has left.
+_FINISHING = 3
+
+
 def _finish(problem: _Problem, proximal: _Problem, scales: _Scales, loop: _Loop, center: Array, wanted):
     """From the last iterate to `(solution of the proximal problem, solution of the problem given, its residual)`.
 
     A step is kept only where it does not make the residual worse.
     """
-    nearer = loop.residual < _residual(proximal, loop.best.y)
-    y = jnp.where(nearer, loop.y, loop.best.y)
-    active = _ActiveSet.at(proximal, y)
-    matrix = _NewtonMatrix(proximal.Q, active.scaling, active.curvature)
-    polished = y + matrix.solve(active.rhs)
-    regular = jnp.where(_residual(proximal, polished) <= loop.residual, polished, y)
-    corrected = regular + matrix.solve(scales.regularization * (regular - center))
-    plain, better = (_residual(problem, x, scales.regularization) for x in (regular, corrected))
-    improves = better <= jnp.maximum(plain, 1e-3 * wanted)
-    return regular, jnp.where(improves, corrected, regular), jnp.where(improves, better, plain)
+
+    def keep_going(state):
+        *_, residual, count = state
+        return (count < _FINISHING) & jnp.any(residual > 1e-4 * wanted)
+
+    def body(state):
+        regular, error, solution, residual, count = state
+        active = _ActiveSet.at(proximal, regular)
+        matrix = _NewtonMatrix(proximal.Q, active.scaling, active.curvature)
+        polished = regular + matrix.solve(active.rhs)
+        new_error = _residual(proximal, polished)
+        improves = new_error <= error
+        regular, error = jnp.where(improves, polished, regular), jnp.where(improves, new_error, error)
+        corrected = regular + matrix.solve(scales.regularization * (regular - center))
+        for y in (regular, corrected):
+            new_residual = _residual(problem, y, scales.regularization)
+            improves = new_residual <= jnp.maximum(residual, 1e-4 * wanted)
+            solution, residual = jnp.where(improves, y, solution), jnp.where(improves, new_residual, residual)
+        return regular, error, solution, residual, count + 1
+
+    error = _residual(proximal, loop.best.y)
+    y = jnp.where(loop.residual < error, loop.y, loop.best.y)
+    start = (y, jnp.minimum(loop.residual, error), y, _residual(problem, y, scales.regularization), jnp.asarray(0))
+    regular, _, solution, residual, _ = jax.lax.while_loop(keep_going, body, start)
+    return regular, solution, residual
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------
 
-BLOCK = 128
-"""Problems solved together: enough to fill vector units, few enough for their matrices to stay in cache."""
+BLOCK = {6: 128, 24: 64}
+"""Problems solved together, by the most rows that a problem has; larger ones: 32. Enough to fill vector units, few enough
+for their matrices to stay in cache and for the slowest not to hold up many."""
+
+
+def _block_size(rows: int) -> int:
+    return next((size for most, size in BLOCK.items() if rows <= most), 32)
+
 
 SMALL = 2
 """Contacts up to which a problem of a larger batch is solved in a small form of its own."""
@@ -640,7 +665,7 @@ def _solve_chosen(arrays, settings, sensitivity, out, chosen, size: int):
     A, v, friction, lower, reference = arrays
     batch, _, d = v.shape
     m = size * d
-    block = min(BLOCK, batch)
+    block = min(_block_size(m), batch)
     order = jnp.nonzero(chosen, size=-(-batch // block) * block, fill_value=batch)[0]
 
     def body(i, out):
