@@ -101,7 +101,7 @@ def main() -> int:
                         some = slice(0, options.clarabel)
                         excess.append(objective_excess(*(x[some] for x in (A, v, friction, lower, f))))
                 for _, (A, v, friction, lower, f, reference) in solved(problems, np.float32):
-                    single.append(kkt_residual(A, v, friction, lower, f, reference, rounded=True))
+                    single.append(kkt_residual(A, v, friction, lower, f, reference))
                     lost += int(np.sum(~np.isfinite(f).all((1, 2))))
         residual, single, excess = (np.concatenate(x) for x in (residual, single, excess))
         total += len(residual) + len(single)

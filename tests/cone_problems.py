@@ -263,7 +263,7 @@ def objective(A, v, f):
     return np.sum(0.5 * f * apply(A, f) + f * v, axis=(1, 2))
 
 
-def kkt_residual(A, v, friction, lower, f, reference=None, *, rounded: bool = False):
+def kkt_residual(A, v, friction, lower, f, reference=None):
     """Largest violation of the optimality conditions by `f`, relative to the problem's scales, (B,).
 
     From the data and the impulse alone. With the velocity after, `g = A f + v`, the optimum has
@@ -279,8 +279,8 @@ def kkt_residual(A, v, friction, lower, f, reference=None, *, rounded: bool = Fa
     `reference`, the velocities before the impact, if larger: of a contact that stuck, compression
     leaves rounding), impulses to that or to the largest impulse, and products to both.
 
-    With `rounded` data, velocities are relative to the largest sum of terms of `A f` too: of a sum of terms that are
-    known to single precision, and cancel, no more can be asked.
+    Velocities are relative to the largest sum of terms `|A| |f|` too: of a sum of rounded terms that cancel, no more
+    can be asked.
     """
     c = contact_scale(A, v.shape[-1])
     present = c > 0
@@ -290,7 +290,7 @@ def kkt_residual(A, v, friction, lower, f, reference=None, *, rounded: bool = Fa
         unit = np.maximum(unit, problem_scale(A, reference, friction, lower))
     unit = np.where(unit > TINY, unit, 1)[:, None, None]
     y, g = f * c / unit, (apply(A, f) + v) / c / unit
-    terms = np.maximum(np.max(apply(np.abs(A), np.abs(f)) / c / unit, axis=(1, 2)), 1)[:, None] if rounded else 1.0
+    terms = np.maximum(np.max(apply(np.abs(A), np.abs(f)) / c / unit, axis=(1, 2)), 1)[:, None]
     low = np.maximum(lower, 0) * c[..., 0] / unit[..., 0]
     slip, push = np.linalg.norm(g[..., 1:], axis=-1), np.linalg.norm(y[..., 1:], axis=-1)
     largest = np.maximum(np.max(np.abs(y), axis=(1, 2)), 1)[:, None]

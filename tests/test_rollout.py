@@ -97,9 +97,13 @@ def test_elastic_impacts_keep_energy(task):
     without = carom.simulate(free, *before, dt=0.01, steps=1)
     kinetic = jax.vmap(system.kinetic_energy)
     old, new = kinetic(without.v[:, 1]), kinetic(out.v[:, 1:].reshape(without.v[:, 1].shape))
-    hit = np.asarray(out.contact[:, 1:]).reshape(-1)
-    assert hit.sum() > 20
-    assert np.max(np.abs(new / old - 1)[hit]) < 1e-9
+    closed = np.sum(np.asarray(system.gaps(without.x[:, 1])) < 0, axis=-1)
+    gain = np.asarray(new / old - 1)
+    assert (closed == 1).sum() > 20
+    assert np.max(np.abs(gain[closed == 1])) < 1e-9
+    # Of several contacts at once, one that only the rebound of the others closes is stopped, not reflected: some energy
+    # goes. None comes.
+    assert np.max(gain) < 1e-9
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ class ConeSettings(NamedTuple):
     def for_dtype(cls, dtype, smoothing: float = 0.0) -> "ConeSettings":
         """Settings that suit problems whose data were computed in `dtype`."""
         if dtype == jnp.float64:
-            return cls(tolerance=1e-8, target=1e-14, diagonal=1e-9, smoothing=smoothing)
+            return cls(tolerance=1e-8, target=1e-10, diagonal=1e-9, smoothing=smoothing)
         return cls(tolerance=1e-4, target=1e-6, diagonal=1e-5, smoothing=smoothing)
 
 
@@ -154,12 +154,11 @@ class _NewtonMatrix:
     then it is the original one, in which `D` is a single entry.
     """
 
-    def __init__(self, problem: _Problem, it: _Iterate, scaling: _Scaling):
-        k, d, batch = it.y.shape
-        curvature = it.w / it.u
+    def __init__(self, Q: Float[Array, "n n B"], scaling: _Scaling, curvature: Float[Array, "K B"]):
+        k, d, batch = scaling.inverse.shape
         self.scaling = scaling
         self.rotated = jnp.max(scaling.inverse, axis=1) ** 2 > curvature
-        H = problem.Q.reshape(k, d, k * d, batch)
+        H = Q.reshape(k, d, k * d, batch)
         H = self.rotate(H).reshape(k * d, k * d, batch).swapaxes(0, 1)
         H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
         # The contact's own block is W^-2 + D e_n e_n^T = (sum_j a_j r_j r_j^T) + D e_n e_n^T in either frame, with r_j
@@ -223,20 +222,27 @@ def _stationarity(problem: _Problem, it: _Iterate):
 
 
 def _merit(problem: _Problem, it: _Iterate, smoothing):
-    """Largest violation of the (perturbed) optimality conditions."""
-    residual = jnp.max(jnp.abs(_stationarity(problem, it)), axis=(0, 1))
-    return jnp.maximum(residual, _complementarity(it) - smoothing)
+    """Largest violation of the (perturbed) optimality conditions.
+
+    The whole product `s o z` counts: `s . z` alone changes only with the square of the angle by which `z` misses `-s`.
+    """
+    identity = jnp.zeros_like(it.y).at[:, 0].set(1)
+    products = jnp.abs(_jordan_product(it.y, it.z) - smoothing * identity)
+    parts = [jnp.abs(_stationarity(problem, it)), products, jnp.abs(it.u * it.w - smoothing)[:, None]]
+    return jnp.max(jnp.concatenate(parts, axis=1), axis=(0, 1))
 
 
-# Mehrotra's second-order term is a guess. Rarely, far from the central path, it leads in circles: an iterate whose
-# last step brought no progress then takes a plain step towards the central path at this fraction of its products.
-_CENTERING = 0.3
+# Mehrotra's second-order term is a guess. Far from the central path it may lead in circles: where two steps brought no
+# progress, the next two go back towards the central path, at this fraction of the products, and without the term.
+_CENTERING = 0.8
+# How much of the way to the boundary a step may go. More leaves the central path behind, and costs iterations in 3D.
+_FRACTION = 0.95
 
 
 def _interior_point_step(problem: _Problem, it: _Iterate, smoothing, careful: Bool[Array, " B"]) -> _Iterate:
     scaling = _Scaling.of(it.y, it.z)
-    matrix = _NewtonMatrix(problem, it, scaling)
     curvature = it.w / it.u
+    matrix = _NewtonMatrix(problem.Q, scaling, curvature)
     gradient = _matvec(problem.Q, it.y) + problem.q
 
     def newton(correction, bound_correction):
@@ -264,34 +270,88 @@ def _interior_point_step(problem: _Problem, it: _Iterate, smoothing, careful: Bo
     correction = scale_inverse(_jordan_divide(scale(it.z), center * identity - product))
     bound_correction = (center - second * affine.u * affine.w) / it.u
     step = newton(correction, bound_correction)
-    fraction = 1 - jnp.clip(0.1 * mean, 1e-3, 0.01)
-    length = jnp.minimum(fraction * _step_length(it, step), 1)
+    length = jnp.minimum(_FRACTION * _step_length(it, step), 1)
     return _advance(it, step, length)
+
+
+def _bound_multiplier(problem: _Problem, g: Array) -> Array:
+    """The largest multiplier of the bounds that leaves `g = Q y + q` in the cone; none where there is no bound."""
+    slip = jnp.sqrt(_dot(g[:, 1:], g[:, 1:]))
+    return jnp.where(problem.lower >= 0, jnp.maximum(g[:, 0] - slip, 0), 0)
 
 
 def _residual(problem: _Problem, y: Array, diagonal: Array | float = 0.0) -> Array:
     """Violation of the optimality conditions of the problem, with `diagonal` taken away from `Q`, by `y` alone.
 
-    The bound's multiplier is the largest that the dual cone leaves it. Impulses are relative to the largest, velocities
-    to the largest term of `Q y + q`: more cannot be asked of data that are rounded. Rounding does not explain what is
-    above `_GROSS`: that is taken as it is, so that huge impulses do not hide a problem without a solution.
+    Impulses are relative to the largest, velocities to the largest term of `Q y + q`: more cannot be asked of data that
+    are rounded. Rounding does not explain what is above `_GROSS`: that is taken as it is, so that huge impulses do not
+    hide a problem without a solution. The whole product `s o z` counts: `s . z` alone changes only with the square of
+    the angle by which a tangential impulse is turned.
     """
     g = _matvec(problem.Q, y) - diagonal * y + problem.q
-    slip, push = jnp.sqrt(_dot(g[:, 1:], g[:, 1:])), jnp.sqrt(_dot(y[:, 1:], y[:, 1:]))
-    free = g[:, 0] - slip
-    w = jnp.maximum(free, 0)
-    above = y[:, 0] - jnp.maximum(problem.lower, 0)
+    w = _bound_multiplier(problem, g)
+    z = _add_normal(g, -w)
+    slip, push = (jnp.sqrt(_dot(a[:, 1:], a[:, 1:])) for a in (z, y))
+    above = y[:, 0] - problem.lower
     impulse = jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
     velocity = jnp.maximum(jnp.max(_matvec(jnp.abs(problem.Q), jnp.abs(y)), axis=(0, 1)), 1)
     primal = jnp.maximum(push - y[:, 0], -above) / impulse
-    cone = jnp.abs((g[:, 0] - w) * y[:, 0] + _dot(g[:, 1:], y[:, 1:])) / impulse
+    cone = jnp.max(jnp.abs(_jordan_product(y, z)), axis=1) / impulse
     bound = jnp.abs(w * above) / impulse
-    dual = jnp.max(jnp.stack([-free, cone, bound]), axis=0)
+    dual = jnp.max(jnp.stack([slip - z[:, 0], cone, bound]), axis=0)
     gross = jnp.where(dual > _GROSS, dual, 0)
     return jnp.max(jnp.max(jnp.stack([primal, dual / velocity, gross]), axis=0), axis=0)
 
 
 _GROSS = 1e-3
+
+# --- The solution itself ----------------------------------------------------------------------------------------
+#
+# At the solution each contact sticks, slides, separates or is held by its bound. With that known, the conditions are
+# smooth equations. Their Newton matrix is the method's own, with the curvatures that those of the central path tend to:
+# along p and m either none (z is zero there) or `_HELD` (s is zero there), across the tangent `z_0 / s_0`. It gives the
+# last digits, which iterates near the boundary lose to rounding, and the derivative.
+
+_HELD = 1e10
+
+
+class _ActiveSet(NamedTuple):
+    scaling: _Scaling
+    curvature: Float[Array, "K B"]  # of the bounds
+    rhs: Float[Array, "K d B"]  # of the Newton step to the solution
+
+    @classmethod
+    def at(cls, problem: _Problem, y: Array, apex: Bool[Array, "K B"] | bool = False):
+        """The active set at `y`, the larger of slack and multiplier deciding.
+
+        Bounds of contacts in `apex` (those that are zero) hold wherever the impulse is next to the apex: so the
+        derivative is the one-sided one for a growing bound, whichever side rounding has put the velocity on.
+        """
+        g = _matvec(problem.Q, y) + problem.q
+        w = _bound_multiplier(problem, g)
+        z = _add_normal(g, -w)
+        u = y[:, 0] - problem.lower
+        push, slip = (jnp.sqrt(_dot(a[:, 1:], a[:, 1:])) for a in (y, z))
+        default = jnp.zeros_like(y[:, 1:]).at[:, 0].set(1)
+        by_slip = jnp.where(slip[:, None] > _TINY, -z[:, 1:] / jnp.maximum(slip, _TINY)[:, None], default)
+        direction = jnp.where(push[:, None] > _TINY, y[:, 1:] / jnp.maximum(push, _TINY)[:, None], by_slip)
+        frame = _Scaling(direction, jnp.ones_like(y))
+        s, z = frame.rotate(y), frame.rotate(z)
+        held = z[:, :2] > s[:, :2]
+        across = jnp.where(held[:, 0], _HELD, jnp.where(held[:, 1], z[:, 1] / jnp.maximum(s[:, 0], _TINY), 0))
+        curvature = jnp.concatenate([jnp.where(held, _HELD, 0), jnp.minimum(across, _HELD)[:, None]], axis=1)
+        pull = frame.restore(
+            jnp.pad(jnp.where(held, z[:, :2] - _HELD * s[:, :2], 0), ((0, 0), (0, y.shape[1] - 2), (0, 0)))
+        )
+        holds = w > u
+        rhs = _add_normal(pull - g, jnp.where(holds, w - _HELD * u, 0))
+        scaling = _Scaling(direction, jnp.sqrt(curvature[:, : y.shape[1]]))
+        return cls(scaling, jnp.where(holds | (apex & (y[:, 0] < _NEAR_APEX)), _HELD, 0), rhs)
+
+
+_TINY = 1e-30
+# An impulse that is nearer to the apex than this is at it, for the derivative.
+_NEAR_APEX = 1e-5
 
 
 class _Loop(NamedTuple):
@@ -305,8 +365,10 @@ class _Loop(NamedTuple):
     iteration: Int[Array, ""]
 
 
-def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) -> _Loop:
-    """Iterate until every problem of the batch has met `target`, or stopped improving."""
+def _interior_point(
+    problem: _Problem, start: _Iterate, solved: Bool[Array, " B"], target: Array, settings: ConeSettings
+) -> _Loop:
+    """Iterate until every problem of the batch that is not `solved` has met `target`, or stopped improving."""
     smoothing = jnp.asarray(settings.smoothing, problem.q.dtype)
     batch = problem.q.shape[-1]
 
@@ -314,7 +376,7 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
         return jnp.any(~loop.done) & (loop.iteration < settings.max_iterations)
 
     def body(loop: _Loop):
-        new = _interior_point_step(problem, loop.it, smoothing, (loop.stalled >= 3) & (loop.stalled % 4 >= 2))
+        new = _interior_point_step(problem, loop.it, smoothing, (loop.stalled >= 2) & (loop.stalled % 3 >= 1))
         merit = _merit(problem, new, smoothing)
         residual = _residual(problem, new.y)
         # An iterate that rounding has pushed out of the interior has a merit that is not finite (or products
@@ -326,9 +388,9 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
         halved = (merit < 0.5 * loop.merit) | (residual < 0.5 * loop.residual)
         stalled = jnp.where(halved, 0, loop.stalled + 1)
         # At the level of rounding nothing more is to be had; far from it, redundant contacts may take a while.
-        patience = jnp.where(loop.merit <= settings.tolerance * 1e-3, 3, 15)
+        patience = jnp.where(loop.merit <= 10 * target, 3, 25)
         merit = jnp.where(better, merit, loop.merit)
-        done = loop.done | ~inside | (merit <= settings.target) | (stalled >= patience)
+        done = loop.done | ~inside | (merit <= target) | (stalled >= patience)
         it = jax.tree.map(lambda a, b: jnp.where(move, a, b), new, loop.it)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, loop.best)
         y = jnp.where(nearer, new.y, loop.y)
@@ -337,7 +399,7 @@ def _interior_point(problem: _Problem, start: _Iterate, settings: ConeSettings) 
 
     merit, residual = _merit(problem, start, smoothing), _residual(problem, start.y)
     zero = jnp.zeros(batch, int)
-    loop = _Loop(start, start, merit, start.y, residual, zero, zero > 0, jnp.asarray(0))
+    loop = _Loop(start, start, merit, start.y, residual, zero, solved, jnp.asarray(0))
     return jax.lax.while_loop(keep_going, body, loop)
 
 
@@ -352,10 +414,13 @@ class _Scales(NamedTuple):
     unit: Float[Array, " B"]
     diagonal: Float[Array, " B"]  # delta
     regularization: Float[Array, "K d B"]  # the diagonal that delta becomes in the scaled problem
+    apex: Bool[Array, "K B"]  # contacts whose bound is zero
 
 
-def _scale(A: Array, v: Array, friction: Array, lower: Array, delta: float) -> tuple[_Problem, _Scales]:
-    """Batch last: A (K, d, K, d, B), v (K, d, B), friction, lower (K, B)."""
+def _scale(
+    A: Array, v: Array, friction: Array, lower: Array, reference: Array, delta: float
+) -> tuple[_Problem, _Scales]:
+    """Batch last: A (K, d, K, d, B), v and reference (K, d, B), friction, lower (K, B)."""
     k, d, batch = v.shape
     dtype = v.dtype
     index = jnp.arange(k)
@@ -374,19 +439,18 @@ def _scale(A: Array, v: Array, friction: Array, lower: Array, delta: float) -> t
     Q = S[:, :, None, None] * A * S[None, None]
     Q = Q.at[index[:, None], jnp.arange(d), index[:, None], jnp.arange(d)].add(regularization + floor)
     q = S * v
-    bounded = present & (lower > -jnp.inf)
+    # A bound of zero is none: the cone has it. It matters for the derivative alone.
+    apex, bounded = present & (lower == 0), present & (lower > 0)
     lower = jnp.where(bounded, lower / jnp.where(present, size, 1), 0)
     largest = jnp.maximum(jnp.max(jnp.abs(q), axis=(0, 1)), jnp.max(lower, axis=0))
+    largest = jnp.maximum(largest, jnp.max(jnp.abs(S * reference), axis=(0, 1)))
     unit = jnp.maximum(largest, jnp.finfo(dtype).tiny ** 0.5)
     q = jnp.where(present[:, None], q / unit, jnp.zeros_like(q).at[:, 0].set(1))
-    lower = jnp.where(bounded, jnp.maximum(lower / unit, _LIFT), _NO_BOUND)
+    lower = jnp.where(bounded, lower / unit, _NO_BOUND)
     problem = _Problem(Q.reshape(k * d, k * d, batch), q, lower)
-    return problem, _Scales(S, size, unit, diagonal, regularization)
+    return problem, _Scales(S, size, unit, diagonal, regularization, apex)
 
 
-# A bound at the cone's apex (lower = 0, as for restitution 0) is lifted by this fraction of the problem's scale, so
-# that there the derivative with respect to the bound is the one-sided one for a growing bound: 1, not a blend.
-_LIFT = 1e-10
 # Where there is no bound, that of the scaled problem is here: the cone keeps the impulse away from it.
 _NO_BOUND = -1.0
 
@@ -409,7 +473,7 @@ class _Sensitivity(NamedTuple):
     diagonal: Float[Array, " B"]  # delta
 
 
-def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: bool):
+def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensitivity: bool):
     """Solve one block of problems: batch first in and out, batch last inside."""
     batch, k, d = v.shape
     n = k * d
@@ -417,7 +481,8 @@ def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
     finite = finite & jnp.isfinite(friction).all(1) & (lower < jnp.inf).all(1)
     A_last = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
     v_last = jnp.moveaxis(v, 0, -1)
-    problem, scales = _scale(A_last, v_last, friction.T, lower.T, settings.diagonal)
+    reference = jnp.moveaxis(reference, 0, -1)
+    problem, scales = _scale(A_last, v_last, friction.T, lower.T, reference, settings.diagonal)
     one = jnp.ones((k, batch), v.dtype)
     identity = jnp.zeros_like(v_last).at[:, 0].set(1)
     start = _Iterate(_add_normal(identity, jnp.maximum(problem.lower, 0)), one, identity, one)
@@ -433,15 +498,20 @@ def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
     if not sensitivity:
         return solution, None
     eye = jnp.broadcast_to(jnp.eye(n, dtype=v.dtype)[..., None], (n, n, batch)).reshape(k, d, n, batch)
-    matrix = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z))
+    if settings.smoothing > 0:
+        scaling, bound = _Scaling.of(it.y, it.z), it.w / it.u
+    else:
+        active = _ActiveSet.at(problem, out.regular, scales.apex)
+        scaling, bound = active.scaling, active.curvature
+    matrix = _NewtonMatrix(problem.Q, scaling, bound)
     inverse = matrix.solve(eye).reshape(n, n, batch)
     size = jnp.broadcast_to(scales.size[:, None], (k, d, batch))
     both = size.reshape(n, 1, batch) * size.reshape(1, n, batch)
     return solution, _Sensitivity(
-        regular=jnp.moveaxis(size * scales.unit * it.y, -1, 0),
-        moved=jnp.moveaxis(size * scales.unit * (it.y - out.center), -1, 0),
+        regular=jnp.moveaxis(size * scales.unit * out.regular, -1, 0),
+        moved=jnp.moveaxis(size * scales.unit * (out.regular - out.center), -1, 0),
         inverse=jnp.moveaxis(inverse * both, -1, 0),
-        bound=(it.w / it.u / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
+        bound=(bound / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
         diagonal=scales.diagonal,
     )
 
@@ -450,7 +520,8 @@ def _solve_block(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
 
 
 class _Solved(NamedTuple):
-    it: _Iterate  # of the regularised problem
+    it: _Iterate  # the best of the regularised problem
+    regular: Float[Array, "K d B"]  # the solution of the regularised problem
     center: Float[Array, "K d B"]  # of its proximal term
     y: Float[Array, "K d B"]  # the solution, without the diagonal
     residual: Float[Array, " B"]
@@ -459,50 +530,101 @@ class _Solved(NamedTuple):
 
 
 # The diagonal is that of a proximal term delta/2 |f - f_0|^2. With f_0 = 0 it selects the solution of least norm; one
-# Newton step without the diagonal then removes most of its effect on the impulse. Where that is not enough (data in
-# single precision, whose delta is large, with singular A or large impulses) the problem is solved again around the
-# solution found: the proximal-point method (Rockafellar, 1976), which needs two or three rounds.
-_ROUNDS = 5
+# Newton step without the diagonal then removes most of its effect on the impulse.
+#
+# Round 0 goes only so far along the central path that the active set can be seen; the step onto it mostly is the end.
+# What is not solved then goes on along the path in round 1. Where that is not enough (data in single precision, whose
+# delta is large, with singular A or large impulses), the problem is solved again around the solution found: the
+# proximal-point method (Rockafellar, 1976), which needs two or three rounds.
+_COARSE = 1e-6
+_ROUNDS = 6
 
 
 def _proximal_point(problem: _Problem, scales: _Scales, start: _Iterate, settings: ConeSettings) -> _Solved:
     batch = problem.q.shape[-1]
-    wanted = jnp.maximum(0.1 * settings.tolerance, settings.smoothing).astype(problem.q.dtype)
+    smooth = settings.smoothing > 0
+    wanted = jnp.asarray(0.1 * settings.tolerance, problem.q.dtype)
 
     def keep_going(best: _Solved):
-        return jnp.any(best.residual > wanted) & (best.rounds < _ROUNDS)
+        return jnp.any(best.residual > wanted) & (best.rounds < (1 if smooth else _ROUNDS))
 
     def body(best: _Solved):
-        center = jnp.where(best.rounds > 0, best.y, 0)
-        loop = _interior_point(problem._replace(q=problem.q - scales.regularization * center), start, settings)
-        it = loop.best
-        matrix = _NewtonMatrix(problem, it, _Scaling.of(it.y, it.z))
-        corrected = it.y + matrix.solve(scales.regularization * (it.y - center))
-        plain, better = (_residual(problem, y, scales.regularization) for y in (loop.y, corrected))
-        y = jnp.where(better < plain, corrected, loop.y)
-        residual = jnp.where(better < plain, better, plain)
-        new = (it, center, y, residual)
+        again = best.rounds > 1
+        center = jnp.where(again, best.y, 0)
+        proximal = problem._replace(q=problem.q - scales.regularization * center)
+        first = jax.tree.map(lambda a, b: jnp.where(again, a, b), start, best.it)
+        coarse = (best.rounds == 0) & (not smooth)
+        target = jnp.where(coarse, jnp.maximum(_COARSE, settings.target), settings.target)
+        loop = _interior_point(proximal, first, best.residual <= wanted, target, settings)
+        if smooth:
+            regular = y = loop.best.y
+            residual = jnp.maximum(loop.merit, 0)
+        else:
+            regular, y, residual = _finish(problem, proximal, scales, loop, center, wanted)
+        new = (loop.best, regular, center, y, residual)
         # A problem that is solved well enough stays as it is; so does one that this round made worse.
         take = (best.residual > wanted) & ((residual < best.residual) | (best.rounds == 0))
-        new = jax.tree.map(lambda a, b: jnp.where(take, a, b), new, tuple(best[:4]))
+        new = jax.tree.map(lambda a, b: jnp.where(take, a, b), new, tuple(best[:5]))
         return _Solved(*new, best.iterations + loop.iteration, best.rounds + 1)
 
     nothing = jnp.zeros_like(start.y)
     zero = jnp.asarray(0)
-    first = _Solved(start, nothing, nothing, jnp.full(batch, jnp.inf, problem.q.dtype), zero, zero)
+    first = _Solved(start, nothing, nothing, nothing, jnp.full(batch, jnp.inf, problem.q.dtype), zero, zero)
     return jax.lax.while_loop(keep_going, body, first)
+
+
+# Newton steps onto the active set: each squares the error that the central path has left.
+_FINISHING = 3
+
+
+def _finish(problem: _Problem, proximal: _Problem, scales: _Scales, loop: _Loop, center: Array, wanted):
+    """From the last iterate to `(solution of the proximal problem, solution of the problem given, its residual)`.
+
+    A step is kept only where it does not make the residual worse.
+    """
+
+    def keep_going(state):
+        *_, residual, count = state
+        return (count < _FINISHING) & jnp.any(residual > 1e-4 * wanted)
+
+    def body(state):
+        regular, error, solution, residual, count = state
+        active = _ActiveSet.at(proximal, regular)
+        matrix = _NewtonMatrix(proximal.Q, active.scaling, active.curvature)
+        polished = regular + matrix.solve(active.rhs)
+        new_error = _residual(proximal, polished)
+        improves = new_error <= error
+        regular, error = jnp.where(improves, polished, regular), jnp.where(improves, new_error, error)
+        corrected = regular + matrix.solve(scales.regularization * (regular - center))
+        for y in (regular, corrected):
+            new_residual = _residual(problem, y, scales.regularization)
+            improves = new_residual <= jnp.maximum(residual, 1e-4 * wanted)
+            solution, residual = jnp.where(improves, y, solution), jnp.where(improves, new_residual, residual)
+        return regular, error, solution, residual, count + 1
+
+    error = _residual(proximal, loop.best.y)
+    y = jnp.where(loop.residual < error, loop.y, loop.best.y)
+    start = (y, jnp.minimum(loop.residual, error), y, _residual(problem, y, scales.regularization), jnp.asarray(0))
+    regular, _, solution, residual, _ = jax.lax.while_loop(keep_going, body, start)
+    return regular, solution, residual
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------
 
-BLOCK = 128
-"""Problems solved together: enough to fill vector units, few enough for their matrices to stay in cache."""
+BLOCK = {6: 128, 24: 64}
+"""Problems solved together, by the most rows that a problem has (more rows: 32). Enough to fill vector units; few enough
+for their matrices to stay in cache, and for the slowest not to hold up many."""
+
+
+def _block_size(rows: int) -> int:
+    return next((size for most, size in BLOCK.items() if rows <= most), 32)
+
 
 SMALL = 2
 """Contacts up to which a problem of a larger batch is solved in a small form of its own."""
 
 
-def _solve_batch(A, v, friction, lower, settings: ConeSettings, sensitivity: bool):
+def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensitivity: bool):
     """Solve a batch block by block. Problems without a contact cost nothing and give zeros.
 
     In a batch with room for many contacts most problems have one or two: these, where they come first in their
@@ -533,21 +655,22 @@ def _solve_batch(A, v, friction, lower, settings: ConeSettings, sensitivity: boo
     at_least = 0
     for size in sizes:
         chosen = (used > at_least) & (used <= size)
-        out = _solve_chosen(A, v, friction, lower, settings, sensitivity, out, chosen, size)
+        out = _solve_chosen((A, v, friction, lower, reference), settings, sensitivity, out, chosen, size)
         at_least = size
     return out
 
 
-def _solve_chosen(A, v, friction, lower, settings, sensitivity, out, chosen, size: int):
+def _solve_chosen(arrays, settings, sensitivity, out, chosen, size: int):
     """Solve the `chosen` problems, of which only the first `size` contacts are used, and put them into `out`."""
+    A, v, friction, lower, reference = arrays
     batch, _, d = v.shape
     m = size * d
-    block = min(BLOCK, batch)
+    block = min(_block_size(m), batch)
     order = jnp.nonzero(chosen, size=-(-batch // block) * block, fill_value=batch)[0]
 
     def body(i, out):
         rows = jax.lax.dynamic_slice(order, (i * block,), (block,))
-        data = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size])
+        data = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
         data = (x.at[rows].get(mode="fill", fill_value=0) for x in data)
         solved = _solve_block(*data, settings, sensitivity)
 
@@ -565,8 +688,8 @@ def _batched(settings: ConeSettings, sensitivity: bool):
     """`_solve_batch` for these settings, whose batching under vmap is one larger batch."""
 
     @jax.custom_batching.custom_vmap
-    def solve(A, v, friction, lower):
-        return _solve_batch(A, v, friction, lower, settings, sensitivity)
+    def solve(A, v, friction, lower, reference):
+        return _solve_batch(A, v, friction, lower, reference, settings, sensitivity)
 
     @solve.def_vmap
     def _(size, batched, *arrays):
@@ -602,9 +725,9 @@ def _apply(A, x):
     return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
-def _impulse(A, v, friction, lower, settings: ConeSettings) -> _Internal:
-    return _batched(settings, False)(A, v, friction, lower)[0]
+@functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
+def _impulse(A, v, friction, lower, reference, settings: ConeSettings) -> _Internal:
+    return _batched(settings, False)(A, v, friction, lower, reference)[0]
 
 
 # The derivative. At the solution (or at the point of the central path where `smoothing` ends) the conditions
@@ -621,21 +744,25 @@ def _impulse(A, v, friction, lower, settings: ConeSettings) -> _Internal:
 # is linear in the tangents and the matrix is the solver's own, so that both modes, vmap and jit follow from this rule.
 @_impulse.defjvp
 def _impulse_jvp(settings, primals, tangents):
-    A, v, friction, _ = primals
-    dA, dv, dfriction, dlower = tangents
+    A, v, friction, *_ = primals
+    dA, dv, dfriction, dlower, _ = tangents  # `reference` only sets a scale
     solution, out = _batched(settings, True)(*primals)
     f = _friction_scale(out.regular, friction)
     after = _apply(A, f) + out.diagonal[:, None, None] * _friction_scale(out.moved, friction) + v
-    # Where mu = 0 the tangent g is not determined by the problem. For a growing mu, friction opposes sliding.
+    # Where mu = 0 the tangent g is not determined by the problem, and z is the apex of its cone. For a growing mu,
+    # friction opposes sliding, g = -f_n after_t / |after_t|, and z leaves the apex along its boundary: z_n = |z_t|,
+    # with z_t = mu after_t.
     tangent = after[..., 1:]
     norm = jnp.sqrt(jnp.sum(tangent**2, axis=-1, keepdims=True))
+    frictionless = friction[..., None] == 0
     sliding = -out.regular[..., :1] * tangent / jnp.where(norm > 0, norm, 1)
-    g = jnp.where(friction[..., None] == 0, sliding, out.regular[..., 1:])
+    g = jnp.where(frictionless, sliding, out.regular[..., 1:])
+    boundary = jnp.where(frictionless, norm * dfriction[..., None], 0)
     dSy = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * g], axis=-1)
     dS_after = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * tangent], axis=-1)
     force = _apply(dA, f) + dv + _apply(A, dSy) + out.diagonal[:, None, None] * dSy
     rhs = -(dS_after + _friction_scale(force, friction))
-    rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None], rhs[..., 1:]], axis=-1)
+    rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None] + boundary, rhs[..., 1:]], axis=-1)
     df = dSy + _friction_scale(_apply(out.inverse, rhs), friction)
     no_tangent = np.zeros(solution.iterations.shape, jax.dtypes.float0)
     return solution, _Internal(df, jnp.zeros_like(solution.residual), no_tangent)
@@ -659,13 +786,15 @@ def solve_cone_problem(
     friction: Float[Array, "B K"],
     lower: Float[Array, "B K"] | None = None,
     *,
+    reference: Float[Array, "B K d"] | None = None,
     smoothing: float = 0.0,
 ) -> ConeSolution:
     """Minimise `1/2 f^T A f + f^T v` over friction cones, for a batch of problems.
 
     **Arguments:** `A` (B, K d, K d), symmetric positive semi-definite, velocity per impulse (1 / kg); `v` (B, K, d),
     velocities of the contact points, normal first (m/s); `friction` (B, K), Coulomb's mu >= 0; `lower` (B, K),
-    least normal impulses (N s), >= 0, or `None` for zero; `smoothing`, final value of the complementarity products
+    least normal impulses (N s), >= 0, or `None` for zero; `reference` (B, K, d), velocities (m/s) that `v` is what
+    remains of, if so: what is small beside them is rounding; `smoothing`, final value of the complementarity products
     relative to the problem's scale. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
     A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is
@@ -680,5 +809,6 @@ def solve_cone_problem(
     widest = jnp.zeros((), float).dtype
     work = widest if widest.itemsize > dtype.itemsize else dtype
     lower = jnp.full_like(friction, -jnp.inf) if lower is None else lower
-    out = _impulse(*(x.astype(work) for x in (A, v, friction, lower)), settings)
+    reference = jnp.zeros_like(v) if reference is None else jax.lax.stop_gradient(reference)
+    out = _impulse(*(x.astype(work) for x in (A, v, friction, lower, reference)), settings)
     return ConeSolution(out.impulse.astype(dtype), out.residual.astype(dtype), out.iterations)

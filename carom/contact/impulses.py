@@ -72,7 +72,7 @@ def two_phases(A, v, friction, restitution, v_star, *, smoothing: float = 0.0) -
     def phase(state, is_rebound):
         velocity, lower = state
         velocity = velocity - jnp.where(is_rebound, v_star, 0)
-        solution = _solve(A, velocity, friction, jnp.where(is_rebound, lower, -jnp.inf), smoothing)
+        solution = _solve(A, velocity, friction, jnp.where(is_rebound, lower, -jnp.inf), smoothing, reference=v)
         change = (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
         return (velocity + change, lower), solution
@@ -114,13 +114,17 @@ def _solve_regular(matrix, rhs, relative):
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
 
-def _solve(A, v, friction, lower, smoothing) -> ConeSolution:
+def _solve(A, v, friction, lower, smoothing, reference=None) -> ConeSolution:
     batch = v.shape[:-2]
 
     def flat(x: Array, rank: int) -> Array:
         return x.reshape(-1, *x.shape[x.ndim - rank :])
 
-    out = solve_cone_problem(flat(A, 2), flat(v, 2), flat(friction, 1), flat(lower, 1), smoothing=smoothing)
+    out = solve_cone_problem(
+        *(flat(A, 2), flat(v, 2), flat(friction, 1), flat(lower, 1)),
+        reference=None if reference is None else flat(reference, 2),
+        smoothing=smoothing,
+    )
     return ConeSolution(out.impulse.reshape(v.shape), out.residual.reshape(batch), out.iterations.reshape(batch))
 
 

@@ -13,6 +13,9 @@ from jaxtyping import Array, Float
 UNROLL_LIMIT = 24
 """Most rows that are eliminated in unrolled form; compile time grows with their square."""
 
+UNROLL_SOLVE_LIMIT = 6
+"""Most rows whose triangular solves are unrolled too; above, they are loops over the rows, which compile at once."""
+
 
 class Cholesky:
     """Cholesky factor `H = L L^T` of a batch of SPD matrices `(n, n, B)`, with the batch last.
@@ -24,13 +27,17 @@ class Cholesky:
         self.size = matrix.shape[0]
         if self.size <= UNROLL_LIMIT:
             self.columns = _factor_unrolled(matrix)
+            if self.size > UNROLL_SOLVE_LIMIT:
+                self.rows = jnp.stack([jnp.pad(c, ((j, 0), (0, 0))) for j, c in enumerate(self.columns)], axis=1)
         else:
             self.lower = jnp.linalg.cholesky(jnp.moveaxis(matrix, -1, 0))
 
     def solve(self, rhs: Float[Array, "n *m B"]) -> Float[Array, "n *m B"]:
         """Solve `H x = rhs` for one or several right-hand sides."""
-        if self.size <= UNROLL_LIMIT:
+        if self.size <= UNROLL_SOLVE_LIMIT:
             return _solve_unrolled(self.columns, rhs)
+        if self.size <= UNROLL_LIMIT:
+            return _solve_by_rows(self.rows, rhs)
         flat = jnp.moveaxis(rhs.reshape(self.size, -1, rhs.shape[-1]), -1, 0)
         x = jax.scipy.linalg.cho_solve((self.lower, True), flat)
         return jnp.moveaxis(x, 0, -1).reshape(rhs.shape)
@@ -60,3 +67,23 @@ def _solve_unrolled(columns: list[Float[Array, "rows B"]], rhs: Float[Array, "n 
             x[j] = x[j] - columns[j][k - j] * x[k]
         x[j] = x[j] / columns[j][0]
     return jnp.stack(x)
+
+
+def _solve_by_rows(lower: Float[Array, "n n B"], rhs: Float[Array, "n *m B"]):
+    n = lower.shape[0]
+    wide = lower.reshape(n, n, *(1,) * (rhs.ndim - 2), lower.shape[-1])
+
+    def forward(j, x):  # entries from j on are still those of the right-hand side
+        known = jnp.sum(jnp.where(_before(n, j, x.ndim), wide[j] * x, 0), axis=0)
+        return x.at[j].set((x[j] - known) / wide[j, j])
+
+    def backward(i, x):
+        j = n - 1 - i
+        known = jnp.sum(jnp.where(_before(n, j + 1, x.ndim), 0, wide[:, j] * x), axis=0)
+        return x.at[j].set((x[j] - known) / wide[j, j])
+
+    return jax.lax.fori_loop(0, n, backward, jax.lax.fori_loop(0, n, forward, rhs))
+
+
+def _before(n: int, j, ndim: int):
+    return (jnp.arange(n) < j).reshape(n, *(1,) * (ndim - 1))
