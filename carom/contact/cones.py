@@ -612,8 +612,10 @@ def _finish(problem: _Problem, proximal: _Problem, scales: _Scales, loop: _Loop,
 # --- Batches ----------------------------------------------------------------------------------------------------
 
 BLOCK = {6: 128, 24: 64}
-"""Problems solved together, by the most rows that a problem has (more rows: 32). Enough to fill vector units; few enough
-for their matrices to stay in cache, and for the slowest not to hold up many."""
+"""Problems solved together, by the most rows that a problem has (more rows: 32).
+
+Enough to fill vector units; few enough for their matrices to stay in cache, and for the slowest not to hold up many.
+"""
 
 
 def _block_size(rows: int) -> int:
