@@ -9,8 +9,19 @@ from systems import ball_on_floor, refused
 import carom
 
 
-@pytest.mark.parametrize("task", ["bp5-e", "cp3"])
-def test_one_step_from_every_recorded_state(task, reference_dir):
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.parametrize(
+    ("task", "bounds"),
+    [
+        # The promises for bp5-e and cp3 are 1e-6 (98 %) and 1e-5 (99.5 %); measured 1e-10 and 4e-10.
+        ("bp5-e", {0.98: 1e-8, 0.995: 1e-7}),
+        ("cp3", {0.98: 1e-8, 0.995: 1e-7}),
+        ("gyro-e", {0.98: 1e-5, 0.995: 1e-4}),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_one_step_from_every_recorded_state(task, bounds, reference_dir):
     data = carom.load_recording(reference_dir / "reference" / f"{task}_trajectories.npz")
     shape = (-1, *data.x.shape[2:])
     start = (jnp.asarray(a[:, :-1].reshape(shape)) for a in (data.x, data.v))
@@ -19,9 +30,8 @@ def test_one_step_from_every_recorded_state(task, reference_dir):
         *(np.abs(a[:, 1] - b[:, 1:].reshape(shape)).max((1, 2)) for a, b in ((out.x, data.x), (out.v, data.v)))
     )
     assert np.array_equal(out.contact[:, 1], data.contact[:, 1:].reshape(-1))
-    # The promise is 1e-6 for 98 % and 1e-5 for 99.5 %; measured 1e-10 and 4e-10.
-    assert np.quantile(errors, 0.98) < 1e-8
-    assert np.quantile(errors, 0.995) < 1e-7
+    for share, bound in bounds.items():
+        assert np.quantile(errors, share) < bound
 
 
 def test_a_bouncing_ball_rises_to_e_squared_of_its_height():
