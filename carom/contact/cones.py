@@ -557,15 +557,18 @@ def _proximal_point(problem: _Problem, scales: _Scales, start: _Iterate, setting
         target = jnp.where(coarse, jnp.maximum(_COARSE, settings.target), settings.target)
         loop = _interior_point(proximal, first, best.residual <= wanted, target, settings)
         if smooth:
-            regular = y = loop.best.y
-            residual = jnp.maximum(loop.merit, 0)
+            new = _Solved(loop.best, loop.best.y, center, loop.best.y, loop.merit, best.iterations, best.rounds)
         else:
-            regular, y, residual = _finish(problem, proximal, scales, loop, center, wanted)
-        new = (loop.best, regular, center, y, residual)
+            finished = _finish(problem, proximal, scales, loop, center, wanted)
+            new = _Solved(loop.best, finished[0], center, *finished[1:], best.iterations, best.rounds)
         # A problem that is solved well enough stays as it is; so does one that this round made worse.
-        take = (best.residual > wanted) & ((residual < best.residual) | (best.rounds == 0))
-        new = jax.tree.map(lambda a, b: jnp.where(take, a, b), new, tuple(best[:5]))
-        return _Solved(*new, best.iterations + loop.iteration, best.rounds + 1)
+        take = (best.residual > wanted) & ((new.residual < best.residual) | (best.rounds == 0))
+
+        def choose(a: Array, b: Array) -> Array:
+            return jnp.where(take, a, b) if a.ndim else a
+
+        chosen = jax.tree.map(choose, new, best)
+        return chosen._replace(iterations=best.iterations + loop.iteration, rounds=best.rounds + 1)
 
     nothing = jnp.zeros_like(start.y)
     zero = jnp.asarray(0)
@@ -573,11 +576,17 @@ def _proximal_point(problem: _Problem, scales: _Scales, start: _Iterate, setting
     return jax.lax.while_loop(keep_going, body, first)
 
 
+def _choose(condition: Array, a: Array, b: Array) -> Array:
+    return jnp.asarray(jnp.where(condition, a, b))
+
+
 # Newton steps onto the active set: each squares the error that the central path has left.
 _FINISHING = 3
 
 
-def _finish(problem: _Problem, proximal: _Problem, scales: _Scales, loop: _Loop, center: Array, wanted):
+def _finish(
+    problem: _Problem, proximal: _Problem, scales: _Scales, loop: _Loop, center: Array, wanted: Array
+) -> tuple[Array, Array, Array]:
     """From the last iterate to `(solution of the proximal problem, solution of the problem given, its residual)`.
 
     A step is kept only where it does not make the residual worse.
@@ -587,23 +596,23 @@ def _finish(problem: _Problem, proximal: _Problem, scales: _Scales, loop: _Loop,
         *_, residual, count = state
         return (count < _FINISHING) & jnp.any(residual > 1e-4 * wanted)
 
-    def body(state):
+    def body(state: tuple[Array, Array, Array, Array, Array]):
         regular, error, solution, residual, count = state
         active = _ActiveSet.at(proximal, regular)
         matrix = _NewtonMatrix(proximal.Q, active.scaling, active.curvature)
         polished = regular + matrix.solve(active.rhs)
         new_error = _residual(proximal, polished)
         improves = new_error <= error
-        regular, error = jnp.where(improves, polished, regular), jnp.where(improves, new_error, error)
+        regular, error = _choose(improves, polished, regular), _choose(improves, new_error, error)
         corrected = regular + matrix.solve(scales.regularization * (regular - center))
         for y in (regular, corrected):
             new_residual = _residual(problem, y, scales.regularization)
             improves = new_residual <= jnp.maximum(residual, 1e-4 * wanted)
-            solution, residual = jnp.where(improves, y, solution), jnp.where(improves, new_residual, residual)
+            solution, residual = _choose(improves, y, solution), _choose(improves, new_residual, residual)
         return regular, error, solution, residual, count + 1
 
     error = _residual(proximal, loop.best.y)
-    y = jnp.where(loop.residual < error, loop.y, loop.best.y)
+    y = _choose(loop.residual < error, loop.y, loop.best.y)
     start = (y, jnp.minimum(loop.residual, error), y, _residual(problem, y, scales.regularization), jnp.asarray(0))
     regular, _, solution, residual, _ = jax.lax.while_loop(keep_going, body, start)
     return regular, solution, residual

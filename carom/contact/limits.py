@@ -56,7 +56,7 @@ class Chain(eqx.Module):
         if self.anchor is not None:
             places = jnp.where(fixed[..., None], self.anchor.astype(x.dtype), places)
         value, gradient = jax.vmap(jax.value_and_grad(gap))(places)
-        normal = jnp.where(fixed[..., None], 0, gradient)
+        normal = jnp.asarray(jnp.where(fixed[..., None], 0, gradient))
         tangent = jnp.stack([-normal[..., 1], normal[..., 0]], axis=-1)
         return Candidates(value, stencil, jnp.stack([normal, tangent], axis=1))
 

@@ -73,11 +73,11 @@ def _solve_by_rows(lower: Float[Array, "n n B"], rhs: Float[Array, "n *m B"]):
     n = lower.shape[0]
     wide = lower.reshape(n, n, *(1,) * (rhs.ndim - 2), lower.shape[-1])
 
-    def forward(j, x):  # entries from j on are still those of the right-hand side
+    def forward(j, x: Array) -> Array:  # entries from j on are still those of the right-hand side
         known = jnp.sum(jnp.where(_before(n, j, x.ndim), wide[j] * x, 0), axis=0)
         return x.at[j].set((x[j] - known) / wide[j, j])
 
-    def backward(i, x):
+    def backward(i, x: Array) -> Array:
         j = n - 1 - i
         known = jnp.sum(jnp.where(_before(n, j + 1, x.ndim), 0, wide[:, j] * x), axis=0)
         return x.at[j].set((x[j] - known) / wide[j, j])
@@ -85,5 +85,5 @@ def _solve_by_rows(lower: Float[Array, "n n B"], rhs: Float[Array, "n *m B"]):
     return jax.lax.fori_loop(0, n, backward, jax.lax.fori_loop(0, n, forward, rhs))
 
 
-def _before(n: int, j, ndim: int):
+def _before(n: int, j, ndim: int) -> Array:
     return (jnp.arange(n) < j).reshape(n, *(1,) * (ndim - 1))
