@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from carom.checks import as_floats, require_values
+from carom.checks import as_floats, require, require_values
 
 
 class Body(eqx.Module):
@@ -31,6 +31,11 @@ class Body(eqx.Module):
         """Inverse of `mass_matrix` (1/kg), in closed form."""
 
 
+def _check_shapes(mass, radius) -> None:
+    require(mass.shape == (), f"mass must be one number of kilograms; its shape was {mass.shape}.")
+    require(radius.shape == (), f"radius must be one number of metres; its shape was {radius.shape}.")
+
+
 class PointMass(Body):
     """A mass at one point, with a radius that matters for contact alone: it does not rotate.
 
@@ -42,6 +47,7 @@ class PointMass(Body):
 
     def __init__(self, mass, radius=0.0):
         self.mass, self.radius = as_floats(mass), as_floats(radius)
+        _check_shapes(self.mass, self.radius)
         require_values("mass", mass, self.mass > 0, "a positive number of kilograms")
         require_values("radius", radius, self.radius >= 0, "zero or a positive number of metres")
 
@@ -71,6 +77,11 @@ class RigidBody(Body):
 
     def __init__(self, mass, moments, radius=0.0):
         self.mass, self.moments, self.radius = as_floats(mass), as_floats(moments), as_floats(radius)
+        _check_shapes(self.mass, self.radius)
+        require(
+            self.moments.shape in ((2,), (3,)),
+            f"moments must be 2 or 3 second moments, one an axis; their shape was {self.moments.shape}.",
+        )
         require_values("mass", mass, self.mass > 0, "a positive number of kilograms")
         require_values("moments", moments, self.moments > 0, "positive second moments in kg m^2, one an axis")
         require_values("radius", radius, self.radius >= 0, "zero or a positive number of metres")
