@@ -1,6 +1,6 @@
 """One time step, and many: `step`, `simulate` and the `Trajectory` they give."""
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
+from carom.contact.candidates import Active
+from carom.contact.cones import ConeSolution
 from carom.contact.impulses import target_velocity, two_phases
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
@@ -80,14 +82,23 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
     return impact(system, x, v, inverse_mass, stepper)
 
 
-def impact(
+class Impact(NamedTuple):
+    """What the closed contacts at a state do: who acts, `M^-1 J_C^T` (K d, n, d), and the impulses of both phases."""
+
+    active: Active
+    response: Float[Array, "Kd n d"]
+    compression: ConeSolution
+    rebound: ConeSolution
+
+
+def solve_impact(
     system: System,
     x: Float[Array, "n d"],
     v: Float[Array, "n d"],
     inverse_mass: Float[Array, "n n"],
     stepper: Stepper,
-) -> StepResult:
-    """Let the contacts that are closed at `x` change the velocity (S.8 to S.15)."""
+) -> Impact:
+    """Impulses of the contacts that are closed at `x` (S.8 to S.15)."""
     active = system.active(x)
     k, d = active.jacobian.shape[:2]
     rows = active.jacobian.reshape(k * d, system.n_points, d)
@@ -111,6 +122,18 @@ def impact(
         v_star,
         smoothing=stepper.smoothing,
     )
+    return Impact(active, response, compression, rebound)
+
+
+def impact(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+) -> StepResult:
+    """Let the contacts that are closed at `x` change the velocity."""
+    active, response, compression, rebound = solve_impact(system, x, v, inverse_mass, stepper)
     impulse = (compression.impulse + rebound.impulse).reshape(-1)
     return StepResult(
         x=x,
