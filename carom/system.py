@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
+from carom.contact.impulses import CM, ContactModel
 from carom.mechanics.bodies import (
     Body,
     BodyTable,
@@ -35,6 +36,7 @@ class System(eqx.Module):
       to them by its `property` index; a single number is shared by all.
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
       candidates, or twice as many as points where that is less: more are an error, never dropped.
+    - `contact_model`: how closed contacts change the velocity; `CM()` by default.
     - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
     - `name`: the task's name, for a task's system.
 
@@ -49,6 +51,7 @@ class System(eqx.Module):
     potential: Potential
     friction: Float[Array, " P"]
     restitution: Float[Array, " P"]
+    contact_model: ContactModel
     dim: int = eqx.field(static=True)
     max_active: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
@@ -62,6 +65,7 @@ class System(eqx.Module):
         friction: ArrayLike = 0.0,
         restitution: ArrayLike = 0.0,
         *,
+        contact_model: ContactModel | None = None,
         max_active: int | None = None,
         dim: int | None = None,
         name: str = "",
@@ -69,6 +73,7 @@ class System(eqx.Module):
         require(len(bodies) > 0, "bodies must hold at least one body; it was empty.")
         self.bodies, self.contacts, self.name = tuple(bodies), tuple(contacts), name
         self.potential = NoPotential() if potential is None else potential
+        self.contact_model = CM() if contact_model is None else contact_model
         self.dim = _dimension(self.bodies, self.contacts, self.potential, dim)
         table = self.table
         rigid = [

@@ -1,11 +1,58 @@
-"""Contact impulses: compression and restitution from the Delassus matrix (paper, appendices C to G)."""
+"""Contact models: from the closed contacts to the velocity jump (paper, appendices C to G)."""
 
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from carom.checks import is_known, require, require_values
+from carom.contact.candidates import Active
 from carom.contact.cones import ConeSettings, ConeSolution, solve_cone_problem
+
+
+class ContactState(NamedTuple):
+    """All that a contact model may look at: the state before the jump and the closed contacts. SI units."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    active: Active
+    response: Float[Array, "r n d"]  # `M^^-1 J_C^T`, rows r = K d by contact, normal first: velocity per impulse
+    delassus: Float[Array, "r r"]  # A
+    velocity: Float[Array, "K d"]  # of the contacts, `J_C v`
+    target: Float[Array, "K d"]  # v_C*, see `target_velocity`
+    friction: Float[Array, " K"]
+    restitution: Float[Array, " K"]
+
+
+class Jump(NamedTuple):
+    """What a contact model answers: the change of the points' velocities, and its relative residual."""
+
+    velocity: Float[Array, "n d"]
+    residual: Float[Array, ""]
+
+
+class ContactModel(eqx.Module):
+    """How closed contacts change the velocity."""
+
+    @abc.abstractmethod
+    def __call__(self, state: ContactState, *, smoothing: float = 0.0) -> Jump:
+        """The velocity jump. Nothing changes where no contact is active."""
+
+
+class CM(ContactModel):
+    """Friction cones and Poisson's restitution in two phases, with the Delassus matrix as it is (S.12 to S.15)."""
+
+    def __call__(self, state, *, smoothing=0.0):
+        compression, rebound = two_phases(
+            state.delassus, state.velocity, state.friction, state.restitution, state.target, smoothing=smoothing
+        )
+        impulse = (compression.impulse + rebound.impulse).reshape(-1)
+        return Jump(
+            jnp.einsum("rid,r->id", state.response, impulse), jnp.maximum(compression.residual, rebound.residual)
+        )
 
 
 def solve_impulse(

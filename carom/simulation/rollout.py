@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
-from carom.contact.impulses import target_velocity, two_phases
+from carom.contact.impulses import ContactState, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
@@ -103,21 +103,22 @@ def impact(
         joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
         depth = jnp.where(active.active, -active.gap, 0)
         v_star = target_velocity(active.jacobian, depth, joints, time=stepper.dt * stepper.compensation_steps)
-    compression, rebound = two_phases(
-        delassus,
-        velocity,
-        system.friction[active.property_index],
-        system.restitution[active.property_index],
-        v_star,
+    jump = system.contact_model(
+        ContactState(
+            x=x,
+            v=v,
+            active=active,
+            response=response,
+            delassus=delassus,
+            velocity=velocity,
+            target=v_star,
+            friction=system.friction[active.property_index],
+            restitution=system.restitution[active.property_index],
+        ),
         smoothing=stepper.smoothing,
     )
-    impulse = (compression.impulse + rebound.impulse).reshape(-1)
     return StepResult(
-        x=x,
-        v=v + jnp.einsum("rid,r->id", response, impulse),
-        contact=jnp.any(active.active),
-        overflow=active.overflow,
-        residual=jnp.maximum(compression.residual, rebound.residual),
+        x=x, v=v + jump.velocity, contact=jnp.any(active.active), overflow=active.overflow, residual=jump.residual
     )
 
 
