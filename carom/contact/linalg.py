@@ -20,34 +20,49 @@ UNROLL_SOLVE_LIMIT = 6
 class Cholesky:
     """Cholesky factor `H = L L^T` of a batch of SPD matrices `(n, n, B)`, with the batch last.
 
-    A matrix that is not positive definite gives NaN in its own lane and no other.
+    With `rhs` (n, m, B), `solution` is that of `H x = rhs`: elimination of the right-hand sides along with the matrix
+    costs much less than `solve` does afterwards. A matrix that is not positive definite gives NaN in its own lane and
+    no other.
     """
 
-    def __init__(self, matrix: Float[Array, "n n B"]):
+    def __init__(self, matrix: Float[Array, "n n B"], rhs: Float[Array, "n m B"] | None = None):
         self.size = matrix.shape[0]
         if self.size <= UNROLL_LIMIT:
-            self.columns = _factor_unrolled(matrix)
-            if self.size > UNROLL_SOLVE_LIMIT:
-                self.rows = jnp.stack([jnp.pad(c, ((j, 0), (0, 0))) for j, c in enumerate(self.columns)], axis=1)
+            extended = _factor_unrolled(matrix if rhs is None else jnp.concatenate([matrix, rhs.swapaxes(0, 1)]))
+            self.columns = [column[: self.size - j] for j, column in enumerate(extended)]
+            if rhs is not None:
+                self.solution = _back_substitute(
+                    self.columns, [column[self.size - j :] for j, column in enumerate(extended)]
+                )
         else:
             self.lower = jnp.linalg.cholesky(jnp.moveaxis(matrix, -1, 0))
+            if rhs is not None:
+                self.solution = self.solve(rhs)
+
+    def triangle(self) -> Float[Array, "B n n"]:
+        """`L`, with the batch first."""
+        return jnp.moveaxis(self._rows(), -1, 0) if self.size <= UNROLL_LIMIT else self.lower
+
+    def _rows(self) -> Float[Array, "n n B"]:
+        return jnp.stack([jnp.pad(c, ((j, 0), (0, 0))) for j, c in enumerate(self.columns)], axis=1)
 
     def solve(self, rhs: Float[Array, "n *m B"]) -> Float[Array, "n *m B"]:
         """Solve `H x = rhs` for one or several right-hand sides."""
         if self.size <= UNROLL_SOLVE_LIMIT:
             return _solve_unrolled(self.columns, rhs)
         if self.size <= UNROLL_LIMIT:
-            return _solve_by_rows(self.rows, rhs)
+            return _solve_by_rows(self._rows(), rhs)
         flat = jnp.moveaxis(rhs.reshape(self.size, -1, rhs.shape[-1]), -1, 0)
         x = jax.scipy.linalg.cho_solve((self.lower, True), flat)
         return jnp.moveaxis(x, 0, -1).reshape(rhs.shape)
 
 
-def _factor_unrolled(matrix: Float[Array, "n n B"]) -> list[Float[Array, "rows B"]]:
+def _factor_unrolled(matrix: Float[Array, "all_rows n B"]) -> list[Float[Array, "_ B"]]:
+    # The columns of L. Rows of `matrix` below the n-th are transposed right-hand sides, which become `L^-1 rhs`.
     # Left-looking: column j of L from column j of H and the columns before it. The division (rather than a
     # product with a reciprocal) also keeps XLA from fusing a column's computation into each of its readers.
     columns = []
-    for j in range(matrix.shape[0]):
+    for j in range(matrix.shape[1]):
         column = matrix[j:, j]
         for k, previous in enumerate(columns):
             column = column - previous[j - k :] * previous[j - k]
@@ -55,7 +70,17 @@ def _factor_unrolled(matrix: Float[Array, "n n B"]) -> list[Float[Array, "rows B
     return columns
 
 
-def _solve_unrolled(columns: list[Float[Array, "rows B"]], rhs: Float[Array, "n *m B"]):
+def _back_substitute(columns: list[Float[Array, "_ B"]], rhs: list[Float[Array, "m B"]]) -> Float[Array, "n m B"]:
+    """Solve `L^T x = rhs`."""
+    x = list(rhs)
+    for j in reversed(range(len(columns))):
+        for k in range(j + 1, len(columns)):
+            x[j] = x[j] - columns[j][k - j] * x[k]
+        x[j] = x[j] / columns[j][0]
+    return jnp.stack(x)
+
+
+def _solve_unrolled(columns: list[Float[Array, "_ B"]], rhs: Float[Array, "n *m B"]):
     n = len(columns)
     x = [rhs[i] for i in range(n)]
     for j in range(n):

@@ -1,0 +1,166 @@
+"""Friction-cone problems: which contacts stick, slide or separate, and Newton steps onto that. Arrays only.
+
+Batch last: see `carom.contact.cones` for the problem, its scaling and the notation.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from carom.contact.cone_algebra import (
+    TINY,
+    NewtonMatrix,
+    Problem,
+    Scaling,
+    add_normal,
+    bound_multiplier,
+    dot,
+    matvec,
+    residual_of,
+)
+from carom.contact.interior_point import Loop
+
+# --- The solution itself ----------------------------------------------------------------------------------------
+#
+# At the solution each contact sticks, slides, separates or is held by its bound. With that known, the conditions are
+# smooth equations. Their Newton matrix is the method's own, with the curvatures that those of the central path tend to:
+# along p and m either none (z is zero there) or `_HELD` (s is zero there), across the tangent `z_0 / s_0`. It gives the
+# last digits, which iterates near the boundary lose to rounding, and the derivative.
+
+_HELD = 1e10
+
+
+class ActiveSet(NamedTuple):
+    scaling: Scaling
+    curvature: Float[Array, "K B"]  # of the bounds
+    rhs: Float[Array, "K d B"]  # of the Newton step to the solution
+    margin: Float[Array, " B"]  # how far the nearest contact is from changing sides
+
+    @classmethod
+    def at(cls, problem: Problem, y: Array, apex: Bool[Array, "K B"] | bool = False):
+        """The active set at `y`, the larger of slack and multiplier deciding.
+
+        Bounds of contacts in `apex` (those that are zero) hold wherever the impulse is next to the apex: so the
+        derivative is the one-sided one for a growing bound, whichever side rounding has put the velocity on.
+        """
+        g = matvec(problem.Q, y) + problem.q
+        w = bound_multiplier(problem, g)
+        z = add_normal(g, -w)
+        u = y[:, 0] - problem.lower
+        push, slip = (jnp.sqrt(dot(a[:, 1:], a[:, 1:])) for a in (y, z))
+        default = jnp.zeros_like(y[:, 1:]).at[:, 0].set(1)
+        by_slip = jnp.where(slip[:, None] > TINY, -z[:, 1:] / jnp.maximum(slip, TINY)[:, None], default)
+        direction = jnp.where(push[:, None] > TINY, y[:, 1:] / jnp.maximum(push, TINY)[:, None], by_slip)
+        frame = Scaling(direction, jnp.ones_like(y))
+        s, z = frame.rotate(y), frame.rotate(z)
+        held = z[:, :2] > s[:, :2]
+        across = jnp.where(held[:, 0], _HELD, jnp.where(held[:, 1], z[:, 1] / jnp.maximum(s[:, 0], TINY), 0))
+        curvature = jnp.concatenate([jnp.where(held, _HELD, 0), jnp.minimum(across, _HELD)[:, None]], axis=1)
+        pull = frame.restore(
+            jnp.pad(jnp.where(held, z[:, :2] - _HELD * s[:, :2], 0), ((0, 0), (0, y.shape[1] - 2), (0, 0)))
+        )
+        holds = w > u
+        rhs = add_normal(pull - g, jnp.where(holds, w - _HELD * u, 0))
+        scaling = Scaling(direction, jnp.sqrt(curvature[:, : y.shape[1]]))
+        margin = jnp.min(jnp.minimum(jnp.min(jnp.maximum(s[:, :2], z[:, :2]), axis=1), jnp.maximum(w, u)), axis=0)
+        return cls(scaling, jnp.where(holds | (apex & (y[:, 0] < _NEAR_APEX)), _HELD, 0), rhs, margin)
+
+
+# An impulse that is nearer to the apex than this is at it, for the derivative.
+_NEAR_APEX = 1e-5
+
+
+def choose(condition: Array, a: Array, b: Array) -> Array:
+    return jnp.asarray(jnp.where(condition, a, b))
+
+
+# Newton steps onto the active set: each squares the error that the central path has left.
+_FINISHING = 3
+
+
+def finish(
+    problem: Problem, proximal: Problem, regularization: Array, loop: Loop, center: Array, wanted: Array
+) -> tuple[Array, Array, Array]:
+    """From the last iterate to `(solution of the proximal problem, solution of the problem given, its residual)`.
+
+    A step is kept only where it does not make the residual worse.
+    """
+
+    def keep_going(state):
+        *_, residual, count = state
+        return (count < _FINISHING) & jnp.any(residual > 1e-4 * wanted)
+
+    def body(state: tuple[Array, Array, Array, Array, Array]):
+        regular, error, solution, residual, count = state
+        active = ActiveSet.at(proximal, regular)
+        matrix = NewtonMatrix(proximal.Q, active.scaling, active.curvature, active.rhs[:, :, None])
+        polished = regular + matrix.solution[:, :, 0]
+        new_error = residual_of(proximal, polished)
+        improves = new_error <= error
+        regular, error = choose(improves, polished, regular), choose(improves, new_error, error)
+        corrected = regular + matrix.solve(regularization * (regular - center))
+        for y in (regular, corrected):
+            new_residual = residual_of(problem, y, regularization)
+            improves = new_residual <= jnp.maximum(residual, 1e-4 * wanted)
+            solution, residual = choose(improves, y, solution), choose(improves, new_residual, residual)
+        return regular, error, solution, residual, count + 1
+
+    error = residual_of(proximal, loop.best.y)
+    y = choose(loop.residual < error, loop.y, loop.best.y)
+    start = (y, jnp.minimum(loop.residual, error), y, residual_of(problem, y, regularization), jnp.asarray(0))
+    regular, _, solution, residual, _ = jax.lax.while_loop(keep_going, body, start)
+    return regular, solution, residual
+
+
+# --- Without the central path -----------------------------------------------------------------------------------
+#
+# Most problems need no central path: some sweeps of projected Gauss-Seidel over the contacts show the active set, and a
+# few Newton steps onto it, each of which may change it, end in the solution.
+
+_SWEEPS = 30
+# Of the step that a bound of the contact's largest eigenvalue allows: the bound is a loose one.
+_OVERRELAXATION = 1.6
+_NEWTON_STEPS = 3
+# Most contacts whose updates are written out; more are a loop, which compiles at once.
+_UNROLLED = 8
+
+
+def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
+    """An impulse near the solution, by projected Gauss-Seidel in the metric of `(f_n, f_t)`."""
+    k, d, batch = problem.q.shape
+    index = jnp.arange(k)
+    Q = problem.Q.reshape(k, d, k, d, batch)
+    metric = jnp.concatenate([jnp.ones_like(mu)[:, None], jnp.broadcast_to(mu[:, None], (k, d - 1, batch))], axis=1)
+    metric = jnp.where(metric > 0, metric, 1)
+    own = jnp.abs(Q[index, :, index]) / (metric[:, :, None] * metric[:, None])
+    stiffness = metric**2 * jnp.max(jnp.sum(own, axis=2), axis=1)[:, None] / _OVERRELAXATION
+
+    rows = problem.Q.reshape(k, d, k * d, batch)
+
+    def contact(i: int | Array, y: Array) -> Array:
+        gradient = jnp.sum(rows[i] * y.reshape(1, k * d, batch), axis=1) + problem.q[i]
+        # The division keeps XLA from computing the sum again for each use of the result.
+        moved = (stiffness[i] * y[i] - gradient) / stiffness[i]
+        normal, m = moved[0], mu[i]
+        length = jnp.sqrt(sum(t**2 for t in moved[1:]))  # of g_t; that of f_t is mu times as much
+        onto = jnp.maximum((normal + m**2 * length) / (1 + m**2), 0)
+        normal = jnp.maximum(jnp.where(length <= normal, normal, onto), problem.lower[i])
+        shrunk = moved * jnp.minimum(1, normal / jnp.maximum(length, TINY))
+        return y.at[i].set(jnp.where(jnp.arange(d)[:, None] == 0, normal, shrunk))
+
+    def body(_, y: Array) -> Array:
+        return jax.lax.fori_loop(0, k, contact, y, unroll=k <= _UNROLLED)
+
+    return jax.lax.fori_loop(0, _SWEEPS, body, jnp.zeros_like(problem.q))
+
+
+def newton_steps(problem: Problem, y: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
+    """`y` after some Newton steps, each onto the active set seen at its start."""
+
+    def body(_, y: Array) -> Array:
+        active = ActiveSet.at(problem, y)
+        return y + NewtonMatrix(problem.Q, active.scaling, active.curvature, active.rhs[:, :, None]).solution[:, :, 0]
+
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, body, y)
