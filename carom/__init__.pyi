@@ -4,6 +4,12 @@ from .contact.candidates import Contact as Contact
 from .contact.candidates import DiskDisk as DiskDisk
 from .contact.candidates import DiskPlane as DiskPlane
 from .contact.candidates import RimPlane as RimPlane
+from .contact.impulses import CM as CM
+from .contact.impulses import LCP as LCP
+from .contact.impulses import CMr as CMr
+from .contact.impulses import ContactModel as ContactModel
+from .contact.impulses import ContactState as ContactState
+from .contact.impulses import Jump as Jump
 from .contact.impulses import contact_impulse as contact_impulse
 from .contact.impulses import solve_impulse as solve_impulse
 from .contact.limits import BendLimit as BendLimit

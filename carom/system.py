@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
-from carom.contact.impulses import CM, ContactModel
+from carom.contact.impulses import ContactModel, contact_model_of
 from carom.mechanics.bodies import (
     Body,
     BodyTable,
@@ -36,11 +36,12 @@ class System(eqx.Module):
       to them by its `property` index; a single number is shared by all.
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
       candidates, or twice as many as points where that is less: more are an error, never dropped.
-    - `contact_model`: how closed contacts change the velocity; `CM()` by default.
+    - `contact_model`: how closed contacts change the velocity: `"cm"`, `"cmr"`, `"lcp"`, or a `ContactModel`.
     - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
     - `name`: the task's name, for a task's system.
 
-    **Raises:** `CaromError` for negative masses, mu < 0, e outside [0, 1], indices out of range, mixed dimensions.
+    **Raises:** `CaromError` for negative masses, mu < 0, e outside [0, 1], indices out of range, mixed dimensions, an
+    unknown contact model.
 
     SI units throughout.
     """
@@ -65,7 +66,7 @@ class System(eqx.Module):
         friction: ArrayLike = 0.0,
         restitution: ArrayLike = 0.0,
         *,
-        contact_model: ContactModel | None = None,
+        contact_model: str | ContactModel = "cm",
         max_active: int | None = None,
         dim: int | None = None,
         name: str = "",
@@ -73,7 +74,7 @@ class System(eqx.Module):
         require(len(bodies) > 0, "bodies must hold at least one body; it was empty.")
         self.bodies, self.contacts, self.name = tuple(bodies), tuple(contacts), name
         self.potential = NoPotential() if potential is None else potential
-        self.contact_model = CM() if contact_model is None else contact_model
+        self.contact_model = contact_model_of(contact_model)
         self.dim = _dimension(self.bodies, self.contacts, self.potential, dim)
         table = self.table
         rigid = [
@@ -106,10 +107,19 @@ class System(eqx.Module):
 
     def with_max_active(self, max_active: int) -> "System":
         """The same system with room for another number of closed contacts in the solver."""
+        return self._with("max_active", max(1, min(max_active, self.n_candidates)))
+
+    def with_contact_model(self, contact_model: str | ContactModel) -> "System":
+        """The same system with another contact model.
+
+        **Raises:** `CaromError` for an unknown one.
+        """
+        return self._with("contact_model", contact_model_of(contact_model))
+
+    def _with(self, name: str, value) -> "System":
         new = object.__new__(System)
         for field in dataclasses.fields(self):
-            object.__setattr__(new, field.name, getattr(self, field.name))
-        object.__setattr__(new, "max_active", max(1, min(max_active, self.n_candidates)))
+            object.__setattr__(new, field.name, value if field.name == name else getattr(self, field.name))
         return new
 
     # --- structure -------------------------------------------------------------------------------------------

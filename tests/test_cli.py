@@ -116,6 +116,36 @@ def test_simulate_writes_a_trajectory_file(capsys):
     assert "Wrote 3 trajectories of 8 states" in capsys.readouterr().out
 
 
+def test_simulate_with_another_contact_model(capsys):
+    options = ("--trajectories", 40, "--steps", 30)
+    command("simulate", "bp5", *options, "--contact-model", "lcp", "--compensation-steps", "None", "--out", "lcp.h5")
+    command("simulate", "bp5", *options, "--out", "cm.h5")
+    lcp, cm = (carom.load_recording(f"{name}.h5") for name in ("lcp", "cm"))
+    assert "contact model lcp" in lcp.source
+    assert np.array_equal(lcp.x[:, 0], cm.x[:, 0])
+    assert np.abs(lcp.v - cm.v).max() > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(800)
+def test_a_run_keeps_its_contact_model_and_compensation(capsys, tmp_path):
+    chosen = ("--contact-model", "cmr", "--epsilon", "learn", "--compensation-steps", "None")
+    command("learn", "cp3", "--out", "run", "--data-contact-model", "lcp", *chosen, *TINY)
+    assert "epsilon" in capsys.readouterr().out
+    run = RunFolder.open("run")
+    config, report = run.read_json("config.json"), run.read_json("report.json")
+    names = ("contact_model", "epsilon", "compensation_steps", "data_contact_model")
+    assert [config[n] for n in names] == ["cmr", "learn", None, "lcp"]
+    assert "contact model lcp" in carom.load_recording(tmp_path / "run" / "test.h5").source
+    learned = carom.load_model(tmp_path / "run" / "model.carom").contact_model
+    assert isinstance(learned, carom.CMr)
+    assert float(learned.epsilon) == report["learned"]["epsilon"] == run.metrics()[-1]["epsilon"]
+    command("evaluate", "run")
+    again = run.read_json("evaluation.json")
+    # The same predictions again: by the contact model and the compensation that were learned with.
+    assert again["trajectory_error"] == report["evaluation"]["trajectory_error"]
+
+
 def test_bad_arguments_are_one_clear_line(capsys, tmp_path):
     assert "Did you mean 'cp3'" in refused(capsys, "learn", "cp33")
     assert "trajectories must be at least 8" in refused(capsys, "learn", "cp3", "--trajectories", 3)
@@ -137,6 +167,13 @@ def test_bad_arguments_are_one_clear_line(capsys, tmp_path):
 def test_bad_configurations_are_one_clear_line(capsys):
     assert "epochs must be at least 1" in refused(capsys, "learn", "cp3", "--epochs", 0)
     assert "initial_restitution" in refused(capsys, "learn", "cp3", "--initial-restitution", 2)
+    for name in ("contact-model", "data-contact-model"):
+        line = refused(capsys, "learn", "cp3", f"--{name}", "soft")
+        assert line.startswith(f"carom: {name.replace('-', '_')} must be one of 'cm', 'cmr', 'lcp'")
+    assert "contact_model must be one of" in refused(capsys, "simulate", "cp3", "--contact-model", "soft")
+    assert "epsilon belongs to the contact model cmr" in refused(capsys, "learn", "cp3", "--epsilon", 0.1)
+    for name in ("learn", "simulate"):
+        assert "compensation_steps must be a positive" in refused(capsys, name, "cp3", "--compensation-steps", 0)
 
 
 @pytest.mark.parametrize("fault", ["nan", "steps", "task", "points", "wall"])

@@ -39,7 +39,13 @@ class Evaluate:
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, truth)
         test = load_recording(self.data or run.path / TEST_DATA, task=name)
-        measures, predicted = evaluate(system, test, truth=truth, formulation=header["formulation"])
+        measures, predicted = evaluate(
+            system,
+            test,
+            truth=truth,
+            formulation=header["formulation"],
+            compensation_steps=header["compensation_steps"],
+        )
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
         pictures(run, system, test, predicted)
         console = Console()

@@ -11,8 +11,9 @@ from rich.console import Console
 
 import carom
 from carom.checks import require
-from carom.cli.arguments import FilePath, FolderPath, TaskName
+from carom.cli.arguments import ContactModelName, FilePath, FolderPath, TaskName
 from carom.cli.tables import evaluation_table, property_table
+from carom.contact.impulses import contact_model_of
 from carom.learning.dataset import Dataset, count_touches, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
 from carom.learning.model_file import save_model
@@ -49,6 +50,8 @@ class Learn:
     """Go on with the training in the folder --out from its last checkpoint."""
     trajectories: int = 800
     """Training trajectories to simulate (and an eighth as many each to validate and to test)."""
+    data_contact_model: ContactModelName = "cm"
+    """Contact model of the simulated data; `--contact-model` is the one to learn with."""
     quick: bool = False
     """A small training of well under a minute, to try things out: few trajectories and epochs."""
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
@@ -72,6 +75,8 @@ class Learn:
     def _run(self, console: Console) -> None:
         truth = task(self.task)
         self.config.check()
+        self.config.prepare(truth)
+        contact_model_of(self.data_contact_model, argument="data_contact_model")
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
         folder = self._folder()
         if not self.resume:
@@ -112,6 +117,7 @@ class Learn:
             "val": str(self.val) if self.val else None,
             "test": str(self.test) if self.test else None,
             "trajectories": self.trajectories,
+            "data_contact_model": self.data_contact_model,
             **dataclasses.asdict(self.config),
             "carom_version": carom.__version__,
             "jax_version": jax.__version__,
@@ -140,7 +146,13 @@ class Learn:
             held = max(self.trajectories // 8, 2)
             counts = {"train": self.trajectories, "val": held, "test": held}
             parts = {
-                name: make_recording(truth, jax.random.fold_in(jax.random.key(self.config.seed), k), count)
+                name: make_recording(
+                    truth,
+                    jax.random.fold_in(jax.random.key(self.config.seed), k),
+                    count,
+                    contact_model=self.data_contact_model,
+                    compensation_steps=self.config.compensation_steps,
+                )
                 for k, (name, count) in enumerate(counts.items())
             }
             return Dataset(parts["train"], parts["val"]), parts["test"]
@@ -153,9 +165,11 @@ class Learn:
         return Dataset.split(data, val=1 / 9, seed=self.config.seed), test
 
     def _finish(self, console, run, system, report: LearnReport, truth, dataset, test) -> None:
-        formulation = FORMULATIONS[self.config.model]
-        save_model(run.path / MODEL, system, formulation=formulation)
-        measures, predicted = evaluate(system, test, truth=truth, formulation=formulation)
+        formulation, compensation = FORMULATIONS[self.config.model], self.config.compensation_steps
+        save_model(run.path / MODEL, system, formulation=formulation, compensation_steps=compensation)
+        measures, predicted = evaluate(
+            system, test, truth=truth, formulation=formulation, compensation_steps=compensation
+        )
         touches = count_touches(dataset.train, truth)
         run.write_json(
             REPORT,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from rich.console import Console
 
 from carom.checks import require
-from carom.cli.arguments import FilePath, FolderPath, TaskName
+from carom.cli.arguments import CompensationSteps, ContactModelName, FilePath, FolderPath, TaskName
 from carom.learning.dataset import recording_of
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import MODEL, RunFolder
@@ -39,8 +39,10 @@ class Simulate:
     """Seed of the initial states."""
     project: bool = True
     """Bring each step's end back onto the constraints."""
-    compensation_steps: float = COMPENSATION_STEPS
-    """Time steps over which a penetration is undone."""
+    contact_model: ContactModelName | None = None
+    """Contact model; by default that of the learned model, or cm."""
+    compensation_steps: CompensationSteps = "auto"
+    """Time steps over which a penetration is undone, or None to leave it; auto: those of the learned model, or 8."""
 
     def after_interrupt(self) -> str:
         """What to say when interrupted."""
@@ -50,6 +52,7 @@ class Simulate:
         """Do it."""
         chosen = find_task(self.task)
         system, formulation, source = chosen.system(), "lagrangian", "carom simulate"
+        compensation = COMPENSATION_STEPS
         if self.run_folder is not None:
             model = RunFolder.open(self.run_folder).path / MODEL
             header = read_model_header(model)
@@ -58,7 +61,12 @@ class Simulate:
                 f"run-folder {self.run_folder} holds a model of task {header['task']!r}, not {self.task!r}.",
             )
             system, formulation = load_model_into(model, system), header["formulation"]
-            source = f"carom simulate, model {model}"
+            source, compensation = f"carom simulate, model {model}", header["compensation_steps"]
+        if self.contact_model is not None:
+            system, source = (
+                system.with_contact_model(self.contact_model),
+                f"{source}, contact model {self.contact_model}",
+            )
         require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
         out = Path(f"{self.task}.h5") if self.out is None else self.out
         if self.initial is not None:
@@ -74,7 +82,7 @@ class Simulate:
             steps=chosen.steps if self.steps is None else self.steps,
             project=self.project,
             formulation=formulation,
-            compensation_steps=self.compensation_steps,
+            compensation_steps=compensation if self.compensation_steps == "auto" else self.compensation_steps,
         )
         save_recording(out, recording_of(trajectory, task=self.task, source=source))
         n, states = trajectory.x.shape[:2]

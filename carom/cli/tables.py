@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from carom.contact.impulses import CMr
 from carom.learning.models import mass_ratios
 from carom.system import System
 
@@ -46,6 +47,8 @@ def property_table(system: System, truth: System, touches: np.ndarray) -> Table:
     for k in range(1, len(true)):
         error = abs(learned[k] / true[k] - 1)
         table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", f"{error:.1e} rel", "")
+    if isinstance(system.contact_model, CMr):
+        table.add_row("epsilon", "contact model", "", f"{float(system.contact_model.epsilon):.5f}", "", "")
     return table
 
 

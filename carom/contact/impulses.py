@@ -1,16 +1,18 @@
 """Contact models: from the closed contacts to the velocity jump (paper, appendices C to G)."""
 
 import abc
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from carom.checks import is_known, require, require_values
+from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.candidates import Active
 from carom.contact.cones import ConeSettings, ConeSolution, solve_cone_problem
+from carom.contact.lcp import solve_lcp_impulse
 
 
 class ContactState(NamedTuple):
@@ -35,7 +37,7 @@ class Jump(NamedTuple):
 
 
 class ContactModel(eqx.Module):
-    """How closed contacts change the velocity."""
+    """How closed contacts change the velocity. A model of your own is a subclass, given as `contact_model`."""
 
     @abc.abstractmethod
     def __call__(self, state: ContactState, *, smoothing: float = 0.0) -> Jump:
@@ -46,13 +48,114 @@ class CM(ContactModel):
     """Friction cones and Poisson's restitution in two phases, with the Delassus matrix as it is (S.12 to S.15)."""
 
     def __call__(self, state, *, smoothing=0.0):
-        compression, rebound = two_phases(
-            state.delassus, state.velocity, state.friction, state.restitution, state.target, smoothing=smoothing
+        return _two_phase_jump(state, smoothing)
+
+
+class CMr(ContactModel):
+    """CM with `A + epsilon I` in place of `A` in the two convex programs (listing S.3).
+
+    Impulses are then unique and smaller than those of CM, so that contacts yield: one with `A = a` keeps the share
+    `epsilon / (a + epsilon)` of its approach after compression. The programs alone see epsilon. The velocity that the
+    restitution phase starts from (S.14) and the jump are what the impulses found do to the real system, by `A`:
+    the supplement has no other difference between CM and CMr than the matrix of the program.
+
+    **Arguments:** `epsilon`, in 1/kg, at least 0 (which is CM); the paper takes 0.01 and tries 0.001 to 0.1. It is a
+    leaf of the pytree and can be learned (`LearnConfig(epsilon="learn")`).
+
+    **Raises:** `CaromError` for an epsilon that is negative, not finite, or not one number.
+    """
+
+    epsilon: Float[Array, ""]
+
+    def __init__(self, epsilon: ArrayLike = 0.01):
+        epsilon = as_floats(epsilon)
+        require(epsilon.ndim == 0, f"epsilon must be one number; its shape was {epsilon.shape}.")
+        require_values("epsilon", epsilon, (epsilon >= 0) & jnp.isfinite(epsilon), "a finite number of at least 0")
+        self.epsilon = epsilon
+
+    def __call__(self, state, *, smoothing=0.0):
+        d = state.velocity.shape[1]
+        # Padding has zero rows in A, by which the solver knows it, and keeps them.
+        present = jnp.repeat(state.active.active, d)
+        return _two_phase_jump(state, smoothing, jnp.where(present, self.epsilon.astype(state.delassus.dtype), 0))
+
+
+class LCP(ContactModel):
+    """Friction pyramids and Newton's restitution as one linear complementarity problem (appendix J).
+
+    The normal velocity after the impact is at least `-e v_n` of the approach (or the target's, if that is larger), and
+    friction opposes sliding relative to the target. Newton's hypothesis is that of velocities, Poisson's (of CM) that
+    of impulses: for one contact without friction they are the same. Unlike in CM, a contact that slides does not lift
+    off. Contacts that squeeze a body and each ask for a rebound may have no solution, which the residual then tells.
+
+    **Arguments:** `facets`, edges of the pyramid in 3D, even and at least 4; in 2D it is the cone.
+
+    **Raises:** `CaromError` for other facets, and if a `smoothing` is asked for: this model has none.
+    """
+
+    facets: int = eqx.field(static=True)
+
+    def __init__(self, facets: int = 4):
+        require(facets >= 4 and facets % 2 == 0, f"facets must be even and at least 4; it was {facets}.")
+        self.facets = facets
+
+    def __call__(self, state, *, smoothing=0.0):
+        require(smoothing == 0, f"smoothing must be 0 with the contact model LCP; it was {smoothing}.")
+        bounce = -state.restitution * jnp.minimum(state.velocity[:, 0], 0)
+        target = state.target[:, 0]
+        # Where both are equal, as at e = 0 without compensation, the derivative is that of the bounce, for a growing e.
+        rebound = jnp.where(bounce >= target, bounce, target)
+        solution = solve_lcp_impulse(
+            state.delassus, state.velocity, state.friction, rebound, state.target[:, 1:], facets=self.facets
         )
-        impulse = (compression.impulse + rebound.impulse).reshape(-1)
-        return Jump(
-            jnp.einsum("rid,r->id", state.response, impulse), jnp.maximum(compression.residual, rebound.residual)
-        )
+        return Jump(_velocity_jump(state, solution.impulse), solution.residual)
+
+
+CONTACT_MODELS: dict[str, type[ContactModel]] = {"cm": CM, "cmr": CMr, "lcp": LCP}
+"""Contact models by the names under which they are chosen and saved."""
+
+
+def contact_model_of(model: str | ContactModel, *, argument: str = "contact_model") -> ContactModel:
+    """The contact model of this name, with its default settings; a `ContactModel` is returned as it is.
+
+    **Raises:** `CaromError` for anything else, that names the `argument`.
+    """
+    if isinstance(model, ContactModel):
+        return model
+    names = ", ".join(map(repr, CONTACT_MODELS))
+    require(
+        isinstance(model, str) and model in CONTACT_MODELS,
+        f"{argument} must be one of {names}, or a ContactModel; it was {model!r}.",
+    )
+    return CONTACT_MODELS[model]()
+
+
+def contact_model_name(model: ContactModel) -> str | None:
+    """The name of a contact model, or `None` for one that carom does not bring."""
+    return next((name for name, kind in CONTACT_MODELS.items() if type(model) is kind), None)
+
+
+def contact_model_settings(model: ContactModel) -> dict[str, Any]:
+    """What besides arrays makes `model` what it is: the static arguments of its class."""
+    return {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.metadata.get("static", False)}
+
+
+def _two_phase_jump(state: ContactState, smoothing: float, diagonal: Float[Array, " r"] | None = None) -> Jump:
+    compression, rebound = two_phases(
+        state.delassus,
+        state.velocity,
+        state.friction,
+        state.restitution,
+        state.target,
+        diagonal=diagonal,
+        smoothing=smoothing,
+    )
+    residual = jnp.maximum(compression.residual, rebound.residual)
+    return Jump(_velocity_jump(state, compression.impulse + rebound.impulse), residual)
+
+
+def _velocity_jump(state: ContactState, impulse: Float[Array, "K d"]) -> Float[Array, "n d"]:
+    return jnp.einsum("rid,r->id", state.response, impulse.reshape(-1))
 
 
 def solve_impulse(
@@ -112,14 +215,20 @@ def contact_impulse(
     return compression.impulse, rebound.impulse
 
 
-def two_phases(A, v, friction, restitution, v_star, *, smoothing: float = 0.0) -> tuple[ConeSolution, ConeSolution]:
-    """`contact_impulse` without its checks, with the solver's residuals."""
+def two_phases(
+    A, v, friction, restitution, v_star, *, diagonal: Array | None = None, smoothing: float = 0.0
+) -> tuple[ConeSolution, ConeSolution]:
+    """`contact_impulse` without its checks, with the solver's residuals.
+
+    `diagonal` (..., K d) is added to that of A in the convex programs alone, not where velocities are computed.
+    """
+    program = A if diagonal is None else A + diagonal[..., None] * jnp.eye(A.shape[-1], dtype=A.dtype)
 
     # The phases differ in their data alone, so that they are one compiled solve, done twice.
     def phase(state, is_rebound):
         velocity, lower = state
         velocity = velocity - jnp.where(is_rebound, v_star, 0)
-        solution = _solve(A, velocity, friction, jnp.where(is_rebound, lower, -jnp.inf), smoothing, reference=v)
+        solution = _solve(program, velocity, friction, jnp.where(is_rebound, lower, -jnp.inf), smoothing, reference=v)
         change = (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
         return (velocity + change, lower), solution

@@ -10,12 +10,17 @@ from carom.checks import require
 from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
-from carom.simulation.rollout import Trajectory, simulate
+from carom.simulation.rollout import COMPENSATION_STEPS, Trajectory, simulate
 from carom.system import System
 
 
 def predict(
-    system: System, recording: Recording, *, formulation: Formulation = "lagrangian", project: bool = True
+    system: System,
+    recording: Recording,
+    *,
+    formulation: Formulation = "lagrangian",
+    project: bool = True,
+    compensation_steps: float | None = COMPENSATION_STEPS,
 ) -> Trajectory:
     """Motion of `system` from the first recorded state of each trajectory, as long as the recording.
 
@@ -29,6 +34,7 @@ def predict(
         steps=recording.x.shape[1] - 1,
         formulation=formulation,
         project=project,
+        compensation_steps=compensation_steps,
         throw=False,
     )
 
@@ -60,11 +66,13 @@ def evaluate(
     *,
     truth: System | None = None,
     formulation: Formulation = "lagrangian",
+    compensation_steps: float | None = COMPENSATION_STEPS,
 ) -> tuple[dict[str, Any], Trajectory]:
     """Measures of `system` on test recordings, and its predictions.
 
     **Arguments:** `system`, learned; `recording`, test data; `truth`, the true system where it is known, for the errors
-    of properties and the drift of the true energy.
+    of properties and the drift of the true energy; `formulation` and `compensation_steps` of the predictions, as those
+    of `simulate`.
 
     **Returns:** a dictionary of numbers (definitions: the paper, section 5 and appendix L; the first of each pair below
     is the paper's) with
@@ -84,7 +92,7 @@ def evaluate(
         f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {shape[0]} in "
         f"{shape[1]}D. Is it a file of another task?",
     )
-    predicted = predict(system, recording, formulation=formulation)
+    predicted = predict(system, recording, formulation=formulation, compensation_steps=compensation_steps)
     relative, bounded = state_errors(recording, predicted)
     later, later_bounded = relative[:, 1:], bounded[:, 1:]
     per_trajectory = np.nanmean(later, axis=1)

@@ -12,15 +12,26 @@ import jax.numpy as jnp
 
 from carom.atomic import write_whole
 from carom.checks import require
+from carom.contact.impulses import CONTACT_MODELS, ContactModel, contact_model_name, contact_model_settings
 from carom.errors import CaromError
 from carom.learning.models import NeuralPotential
+from carom.simulation.rollout import COMPENSATION_STEPS
 from carom.system import System
 
 MAGIC = b"carom model 1\n"
 
 
-def save_model(path: str | Path, system: System, *, formulation: str = "lagrangian") -> None:
+def save_model(
+    path: str | Path,
+    system: System,
+    *,
+    formulation: str = "lagrangian",
+    compensation_steps: float | None = COMPENSATION_STEPS,
+) -> None:
     """Save a learned system. To load it again, its skeleton is needed (a task's is found by its name).
+
+    **Arguments:** `path`, of the file; `system`, with its contact model; `formulation` and `compensation_steps`, how
+    it was simulated when it was learned.
 
     **Raises:** `CaromError` if the file cannot be written.
     """
@@ -32,6 +43,11 @@ def save_model(path: str | Path, system: System, *, formulation: str = "lagrangi
         "formulation": formulation,
         "points": system.n_points,
         "dim": system.dim,
+        "compensation_steps": compensation_steps,
+        "contact_model": {
+            "name": contact_model_name(system.contact_model),
+            **contact_model_settings(system.contact_model),
+        },
         "network": None,
         "sha256": hashlib.sha256(payload).hexdigest(),
     }
@@ -46,12 +62,14 @@ def save_model(path: str | Path, system: System, *, formulation: str = "lagrangi
 
 
 def read_model_header(path: str | Path) -> dict[str, Any]:
-    """What a model file says of itself: task, formulation, sizes."""
-    return _read(Path(path))[0]
+    """What a model file says of itself: task, formulation, compensation steps, contact model, sizes."""
+    return {"compensation_steps": COMPENSATION_STEPS, **_read(Path(path))[0]}
 
 
 def load_model_into(path: str | Path, skeleton: System) -> System:
-    """The learned system of a file, with the structure of `skeleton`.
+    """The learned system of a file, with the structure of `skeleton` and the contact model of the file.
+
+    A contact model of your own class is taken from the skeleton, with the numbers of the file.
 
     **Raises:** `CaromError` if the file cannot be read, is damaged, or belongs to another system.
     """
@@ -72,6 +90,7 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
             key=jax.random.key(0),
         )
         skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)
+    skeleton = skeleton.with_contact_model(_contact_model(path, header) or skeleton.contact_model)
     try:
         return eqx.tree_deserialise_leaves(io.BytesIO(payload), skeleton)
     except (RuntimeError, ValueError, EOFError, TypeError) as error:
@@ -79,6 +98,18 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
             f"the model {path} does not fit the skeleton ({str(error).splitlines()[0]}). Give the skeleton it was "
             "learned with, in the same precision."
         ) from error
+
+
+def _contact_model(path: str | Path, header: dict[str, Any]) -> ContactModel | None:
+    settings = dict(header.get("contact_model", {}))
+    name = settings.pop("name", None)
+    if name is None:
+        return None
+    require(
+        name in CONTACT_MODELS,
+        f"the model {path} was learned with the contact model {name!r}, which this version of carom does not have.",
+    )
+    return CONTACT_MODELS[name](**settings)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes]:

@@ -53,6 +53,7 @@ class Unknowns(eqx.Module):
     friction: Float[Array, " P"] | None
     restitution: Float[Array, " P"] | None
     potential: NeuralPotential | None
+    log_epsilon: Float[Array, ""] | None = None  # of the contact model CMr: its epsilon is positive, of any magnitude
 
     def assemble(self, skeleton: System) -> System:
         """The system with these unknowns filled in."""
@@ -66,6 +67,8 @@ class Unknowns(eqx.Module):
             value = getattr(self, name)
             if value is not None:
                 system = eqx.tree_at(lambda s, name=name: getattr(s, name), system, value)
+        if self.log_epsilon is not None:
+            system = eqx.tree_at(lambda s: s.contact_model.epsilon, system, jnp.exp(self.log_epsilon))
         return system
 
     def project(self) -> "Unknowns":

@@ -39,6 +39,8 @@ class TrainingProgress:
             values = metrics[name]
             mean = sum(values) / max(len(values), 1)
             parts.append(f"{name} {mean:.4f}" if len(values) == 1 else f"mean {name} {mean:.3f}")
+        if "epsilon" in metrics:
+            parts.append(f"epsilon {metrics['epsilon']:.2e}")
         text = "  ".join(parts)
         epoch = metrics["epoch"]
         self.live.update(self.bar, completed=epoch, text=text)

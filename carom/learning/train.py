@@ -13,13 +13,15 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from carom.checks import require
+from carom.contact.impulses import CMr, contact_model_name, contact_model_of
+from carom.errors import CaromError
 from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.progress import TrainingProgress
 from carom.learning.run import RunFolder
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
-from carom.simulation.rollout import COMPENSATION_STEPS, Stepper, step
+from carom.simulation.rollout import COMPENSATION_STEPS, Stepper, check_compensation_steps, step
 from carom.system import System
 
 Model = Literal["clnn", "chnn"]
@@ -63,8 +65,12 @@ class LearnConfig:
     """Friction at the start."""
     initial_restitution: float = 0.5
     """Restitution at the start."""
-    compensation_steps: float = COMPENSATION_STEPS
-    """Time steps over which the contact model undoes a penetration."""
+    contact_model: str | None = None
+    """Contact model to learn with: cm, cmr or lcp. None: the skeleton's own, which is cm for the named tasks."""
+    epsilon: float | Literal["learn"] | None = None
+    """Epsilon of the contact model cmr (1/kg), or "learn" to learn it. None: the skeleton's, or 0.01."""
+    compensation_steps: float | None = COMPENSATION_STEPS
+    """Time steps over which the contact model undoes a penetration, or None to leave it."""
     project: bool = False
     """Bring predictions back onto the constraints (recorded data may drift; then a projection would be an error)."""
     seed: int = 0
@@ -82,7 +88,15 @@ class LearnConfig:
             require(getattr(self, name) > 0, f"{name} must be positive; it was {getattr(self, name)}.")
         require(self.loss_width >= 0, f"loss_width must not be negative; it was {self.loss_width}.")
         require(self.weight_decay >= 0, f"weight_decay must not be negative; it was {self.weight_decay}.")
-        require(self.compensation_steps > 0, f"compensation_steps must be positive; it was {self.compensation_steps}.")
+        check_compensation_steps(self.compensation_steps)
+        if self.contact_model is not None:
+            contact_model_of(self.contact_model)
+        require(
+            self.epsilon is None or self.epsilon == "learn" or isinstance(self.epsilon, int | float),
+            f'epsilon must be a number, or "learn"; it was {self.epsilon!r}.',
+        )
+        if isinstance(self.epsilon, int | float):
+            CMr(self.epsilon)
         require(self.initial_friction >= 0, f"initial_friction must be at least 0; it was {self.initial_friction}.")
         require(
             0 <= self.initial_restitution <= 1,
@@ -91,6 +105,22 @@ class LearnConfig:
         require(self.model in FORMULATIONS, f"model must be one of {sorted(FORMULATIONS)}; it was {self.model!r}.")
         unknown = set(self.learn) - {"mass", "friction", "restitution", "potential"}
         require(not unknown and len(self.learn) > 0, f"learn must name quantities to learn; it was {self.learn}.")
+
+    def prepare(self, skeleton: System) -> System:
+        """`skeleton` with the contact model that is asked for.
+
+        **Raises:** `CaromError` if an epsilon is asked of a contact model that has none.
+        """
+        if self.contact_model not in (None, contact_model_name(skeleton.contact_model)):
+            skeleton = skeleton.with_contact_model(self.contact_model)
+        if self.epsilon is None:
+            return skeleton
+        require(
+            isinstance(skeleton.contact_model, CMr),
+            f"epsilon belongs to the contact model cmr; the contact model was "
+            f"{type(skeleton.contact_model).__name__} and epsilon {self.epsilon!r}. Give contact_model cmr too.",
+        )
+        return skeleton if self.epsilon == "learn" else skeleton.with_contact_model(CMr(self.epsilon))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,6 +137,8 @@ class LearnReport:
     stopped_early: bool
     skipped_steps: int
     overflowed_contacts: int
+    epsilon: float | None = None
+    """Of the contact model CMr."""
 
 
 class TrainState(eqx.Module):
@@ -125,6 +157,7 @@ class TrainState(eqx.Module):
 def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
     """Starting values: equal masses, the configured friction and restitution, a random network.
 
+    An epsilon that is learned starts from the skeleton's, whose contact model must be CMr.
     A potential of the skeleton that is itself a `NeuralPotential` is taken as the starting point.
     """
     floats = skeleton.friction.dtype
@@ -144,7 +177,15 @@ def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
         friction=chosen("friction", jnp.full(count, config.initial_friction, floats)),
         restitution=chosen("restitution", jnp.full(count, config.initial_restitution, floats)),
         potential=chosen("potential", potential),
+        log_epsilon=_initial_log_epsilon(skeleton) if config.epsilon == "learn" else None,
     )
+
+
+def _initial_log_epsilon(skeleton: System) -> Float[Array, ""]:
+    model = skeleton.contact_model
+    if not isinstance(model, CMr) or float(model.epsilon) == 0:
+        raise CaromError('epsilon "learn" starts from the skeleton\'s: its contact model must be CMr, epsilon above 0.')
+    return jnp.log(model.epsilon)
 
 
 def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
@@ -332,6 +373,7 @@ def learn(
     """
     config = LearnConfig() if config is None else config
     config.check()
+    skeleton = config.prepare(skeleton)
     most = check_dataset(skeleton, dataset, config)
     # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
     trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
@@ -349,7 +391,7 @@ def learn(
         dt=jnp.asarray(train.dt),
         formulation=FORMULATIONS[config.model],
         project=config.project,
-        compensation_steps=float(config.compensation_steps),
+        compensation_steps=None if config.compensation_steps is None else float(config.compensation_steps),
     )
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
     speed = float(np.sqrt(np.mean(train.v[np.arange(train.v.shape[1]) < train.length[:, None]] ** 2)))
@@ -443,10 +485,13 @@ def _keep_best(state: TrainState, val_loss, epoch: int) -> TrainState:
     return dataclasses.replace(state, best=state.unknowns, best_loss=val_loss, best_epoch=jnp.asarray(epoch))
 
 
-def quantities(system: System) -> dict[str, list[float]]:
-    """The physical quantities of a system, for metrics and reports."""
-    return {
+def quantities(system: System) -> dict[str, Any]:
+    """The physical quantities of a system, for metrics and reports; epsilon too, of a contact model that has one."""
+    out = {
         "friction": np.asarray(system.friction).tolist(),
         "restitution": np.asarray(system.restitution).tolist(),
         "mass_ratio": mass_ratios(system).tolist(),
     }
+    if isinstance(system.contact_model, CMr):
+        out["epsilon"] = float(system.contact_model.epsilon)
+    return out

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
-from carom.contact.impulses import ContactState, target_velocity
+from carom.contact.impulses import ContactModel, ContactState, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
@@ -20,6 +20,14 @@ ImpactRule = Literal["step"]
 
 COMPENSATION_STEPS = 8.0
 """Time steps over which a penetration is undone, by default (paper, appendix G)."""
+
+
+def check_compensation_steps(steps: float | None) -> None:
+    """Raise `CaromError` unless `steps` is a positive number, or `None` for no compensation."""
+    require(
+        steps is None or 0 < steps < np.inf,
+        f"compensation_steps must be a positive number, or None for no compensation; it was {steps}.",
+    )
 
 
 class Trajectory(eqx.Module):
@@ -167,6 +175,7 @@ def simulate(
     formulation: Formulation = "lagrangian",
     solver: diffrax.AbstractSolver | None = None,
     compensation_steps: float | None = COMPENSATION_STEPS,
+    contact_model: str | ContactModel | None = None,
     smoothing: float = 0.0,
     throw: bool = True,
 ) -> Trajectory:
@@ -182,13 +191,16 @@ def simulate(
     - `formulation`: `"lagrangian"` or `"hamiltonian"`; the same motion.
     - `solver`: any explicit diffrax solver; by default `RK4`.
     - `compensation_steps`: time steps over which penetration is undone, or `None` to leave it.
+    - `contact_model`: `"cm"`, `"cmr"`, `"lcp"` or a `ContactModel`, in place of the system's own.
     - `smoothing`: see `solve_impulse`.
     - `throw`: raise on a result that is not right, where it can be seen (outside of jit). If false, or traced, look at
       `Trajectory.overflow` and `Trajectory.residual`.
 
     **Raises:** `CaromError` for shapes that do not fit, NaN, a start inside a wall or off the constraints, more closed
-    contacts than `max_active`, an unsolved contact, motion that is not finite.
+    contacts than `max_active`, an unsolved contact, motion that is not finite, an unknown contact model.
     """
+    if contact_model is not None:
+        system = system.with_contact_model(contact_model)
     x0, v0 = as_floats(x0), as_floats(v0)
     require(impact == "step", f'impact must be "step"; it was {impact!r}.')
     require(formulation in FIELDS, f"formulation must be one of {sorted(FIELDS)}; it was {formulation!r}.")
@@ -196,10 +208,7 @@ def simulate(
         isinstance(steps, int | np.integer) and steps > 0, f"steps must be a positive whole number; it was {steps}."
     )
     require_values("dt", dt, np.asarray(dt) > 0 if is_known(dt) else True, "a positive number of seconds")
-    require(
-        compensation_steps is None or compensation_steps > 0,
-        f"compensation_steps must be positive, or None for none; it was {compensation_steps}.",
-    )
+    check_compensation_steps(compensation_steps)
     check_initial_state(system, x0, v0)
     if force is not None:
         force = as_floats(force)

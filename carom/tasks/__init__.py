@@ -7,10 +7,11 @@ from pathlib import Path
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from carom.checks import require
+from carom.contact.impulses import ContactModel, contact_model_name
 from carom.learning.dataset import recording_of
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.simulation.files import Recording
-from carom.simulation.rollout import simulate
+from carom.simulation.rollout import COMPENSATION_STEPS, simulate
 from carom.system import System
 from carom.tasks.base import Task as Task
 from carom.tasks.bouncing import BP5, BP5_E
@@ -31,12 +32,14 @@ def find_task(name: str) -> Task:
     return TASKS[name]
 
 
-def task(name: str) -> System:
+def task(name: str, *, contact_model: str | ContactModel = "cm") -> System:
     """The system of a named task, with its true parameters.
 
-    **Raises:** `CaromError` for an unknown name.
+    **Arguments:** `name`, of the task; `contact_model`, `"cm"` (the paper's), `"cmr"`, `"lcp"` or a `ContactModel`.
+
+    **Raises:** `CaromError` for an unknown name or contact model.
     """
-    return find_task(name).system()
+    return find_task(name).system().with_contact_model(contact_model)
 
 
 def sample(system: System, key: PRNGKeyArray, n: int) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
@@ -54,12 +57,27 @@ def sample(system: System, key: PRNGKeyArray, n: int) -> tuple[Float[Array, "N n
     return find_task(system.name).sample(system, key, n)
 
 
-def make_recording(system: System, key: PRNGKeyArray, n: int) -> Recording:
-    """`n` simulated trajectories of a task's system, at the task's time step and length."""
+def make_recording(
+    system: System,
+    key: PRNGKeyArray,
+    n: int,
+    *,
+    contact_model: str | ContactModel | None = None,
+    compensation_steps: float | None = COMPENSATION_STEPS,
+) -> Recording:
+    """`n` simulated trajectories of a task's system, at the task's time step and length.
+
+    **Arguments:** `system`, `key` and `n` as those of `sample`; `contact_model`, in place of the system's own, and
+    `compensation_steps` as those of `simulate`.
+    """
     x0, v0 = sample(system, key, n)
+    if contact_model is not None:
+        system = system.with_contact_model(contact_model)
     chosen = find_task(system.name)
-    trajectory = simulate(system, x0, v0, dt=chosen.dt, steps=chosen.steps)
-    return recording_of(trajectory, task=system.name, source="carom")
+    trajectory = simulate(system, x0, v0, dt=chosen.dt, steps=chosen.steps, compensation_steps=compensation_steps)
+    model = contact_model_name(system.contact_model)
+    source = "carom" if model == "cm" else f"carom, contact model {model or 'of its own'}"
+    return recording_of(trajectory, task=system.name, source=source)
 
 
 def load_model(path: str | os.PathLike, skeleton: System | None = None) -> System:
