@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from carom.contact.active_set import ActiveSet, finish, newton_steps, sweep
+from carom.contact.batching import as_one_batch, contacts_used, sizes, solve_chosen
 from carom.contact.cone_algebra import (
     ConeSettings,
     Iterate,
@@ -232,10 +233,6 @@ def _block_size(rows: int) -> int:
     return next((size for most, size in BLOCK.items() if rows <= most), 32)
 
 
-SMALL = 2
-"""Contacts up to which a problem of a larger batch is solved in a small form of its own."""
-
-
 def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensitivity: bool):
     """Solve a batch block by block. Problems without a contact cost nothing and give zeros.
 
@@ -243,82 +240,32 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
     problem, are solved without the room that they do not use.
     """
     batch, k, d = v.shape
-    index = jnp.arange(k)
-    diagonal = A.reshape(batch, k, d, k, d)[:, index, 0, index, 0]
-    present = ~(diagonal <= 0)  # NaN counts as present, so that it is reported
-    used = jnp.max(jnp.where(present, index + 1, 0), axis=1)
-    out = _Internal(
+    used = contacts_used(A, k)
+    solution = _Internal(
         impulse=jnp.zeros((batch, k, d), v.dtype),
         residual=jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype)),
         iterations=jnp.zeros(batch, int),
     )
-    extra = _Sensitivity.nothing(batch, k, d, v.dtype) if sensitivity else None
-    out = (out, extra)
-    sizes = (SMALL, k) if k > 2 * SMALL else (k,)
+    out = (solution, _Sensitivity.nothing(batch, k, d, v.dtype) if sensitivity else None)
+    # Rounding leaves too little of single precision to tell a solution of the short way from others.
+    ways = (True, False) if settings.smoothing == 0 and v.dtype == jnp.float64 else (False,)
     at_least = 0
-    for size in sizes:
-        chosen = (used > at_least) & (used <= size)
-        # Rounding leaves too little of single precision to tell a solution of the short way from others.
-        for short in (True, False) if settings.smoothing == 0 and v.dtype == jnp.float64 else (False,):
-            missing = chosen & ~(out[0].residual <= _wanted(settings))
-            out = _solve_chosen((A, v, friction, lower, reference), settings, sensitivity, out, missing, size, short)
+    for size in sizes(k):
+        m = size * d
+        arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
+        for short in ways:
+            missing = (used > at_least) & (used <= size) & ~(out[0].residual <= _wanted(settings))
+            solve = functools.partial(_solve_block, settings=settings, sensitivity=sensitivity, short=short)
+            out = solve_chosen(solve, arrays, missing, _block_size(m), out)
         at_least = size
     return out
-
-
-def _solve_chosen(arrays, settings, sensitivity, out, chosen, size: int, short: bool):
-    """Solve the `chosen` problems, of which only the first `size` contacts are used, and put them into `out`."""
-    A, v, friction, lower, reference = arrays
-    batch, _, d = v.shape
-    m = size * d
-    block = min(_block_size(m), batch)
-    order = jnp.nonzero(chosen, size=-(-batch // block) * block, fill_value=batch)[0]
-
-    def body(i, out):
-        rows = jax.lax.dynamic_slice(order, (i * block,), (block,))
-        data = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
-        data = (x.at[rows].get(mode="fill", fill_value=0) for x in data)
-        solved = _solve_block(*data, settings, sensitivity, short)
-
-        def put(whole, part):
-            return whole.at[(rows, *(slice(0, s) for s in part.shape[1:]))].set(part, mode="drop")
-
-        return jax.tree.map(put, out, solved)
-
-    blocks = (jnp.sum(chosen) + block - 1) // block
-    return jax.lax.fori_loop(0, blocks, body, out)
 
 
 @functools.cache
 def _batched(settings: ConeSettings, sensitivity: bool):
     """`_solve_batch` for these settings, whose batching under vmap is one larger batch."""
-
-    @jax.custom_batching.custom_vmap
-    def solve(A, v, friction, lower, reference):
-        return _solve_batch(A, v, friction, lower, reference, settings, sensitivity)
-
-    @solve.def_vmap
-    def _(size, batched, *arrays):
-        flat = []
-        for x, is_batched in zip(arrays, batched, strict=True):
-            x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
-            flat.append(x.reshape(-1, *x.shape[2:]))
-        out = solve(*flat)
-        out = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
-
-    @jax.custom_jvp
-    def undifferentiated(*arrays):
-        return solve(*arrays)
-
-    @undifferentiated.defjvp
-    def _(primals, tangents):
-        raise NotImplementedError(
-            "carom's cone solver has first derivatives only: its derivative cannot be differentiated again. "
-            "Use a Gauss-Newton approximation, or differences of gradients, in place of second derivatives."
-        )
-
-    return undifferentiated
+    solve = functools.partial(_solve_batch, settings=settings, sensitivity=sensitivity)
+    return as_one_batch(solve, "cone solver")
 
 
 def _friction_scale(x, friction):
