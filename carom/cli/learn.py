@@ -13,8 +13,9 @@ import carom
 from carom.checks import require
 from carom.cli.arguments import FilePath, FolderPath, TaskName
 from carom.cli.tables import evaluation_table, property_table
-from carom.learning.dataset import Dataset, count_touches, trajectory_of
+from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
+from carom.learning.identify import identify
 from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
 from carom.learning.train import FORMULATIONS, LearnConfig, LearnReport, learn, quantities
@@ -156,12 +157,24 @@ class Learn:
         formulation = FORMULATIONS[self.config.model]
         save_model(run.path / MODEL, system, formulation=formulation)
         measures, predicted = evaluate(system, test, truth=truth, formulation=formulation)
-        touches = count_touches(dataset.train, truth)
+        console.print("Finding what the data can tell ...", highlight=False)
+        found = identify(
+            system,
+            dataset.train,
+            learned=self.config.learn,
+            formulation=formulation,
+            compensation_steps=self.config.compensation_steps,
+            project=self.config.project,
+        )
         run.write_json(
             REPORT,
-            {"learned": dataclasses.asdict(report), "evaluation": measures, "touches": touches.tolist()},
+            {
+                "learned": dataclasses.asdict(report),
+                "evaluation": measures,
+                "identification": dataclasses.asdict(found),
+            },
         )
-        console.print(property_table(system, truth, touches))
+        console.print(property_table(system, truth, found))
         console.print(evaluation_table(measures))
         if report.skipped_steps or report.overflowed_contacts:
             console.print(

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from carom.learning.identify import Estimate, Identification
 from carom.learning.models import mass_ratios
 from carom.system import System
 
@@ -20,33 +21,42 @@ def property_names(system: System) -> list[str]:
     ]
 
 
-def property_table(system: System, truth: System, touches: np.ndarray) -> Table:
-    """Learned and true friction, restitution and mass ratios, with errors.
-
-    `touches` (P,): recorded states in which a contact of each property is closed; few tell little.
-    """
+def property_table(system: System, truth: System, found: Identification) -> Table:
+    """Learned and true friction, restitution and mass ratios, with errors, and what the data tell of each."""
     table = Table(title="Learned and true")
     for name in ("quantity", "of"):
         table.add_column(name)
-    for name in ("true", "learned", "error", "touches"):
+    for name in ("true", "learned", "error", "impacts", "refined +- 95 %"):
         table.add_column(name, justify="right")
+    table.add_column("told")
     names = property_names(system)
     for quantity in ("friction", "restitution"):
         learned, true = np.asarray(getattr(system, quantity)), np.asarray(getattr(truth, quantity))
+        told = getattr(found, quantity) or [None] * len(names)
         for k, name in enumerate(names):
-            table.add_row(
-                quantity,
-                name,
-                f"{true[k]:.4f}",
-                f"{learned[k]:.5f}",
-                f"{abs(learned[k] - true[k]):.1e}",
-                str(touches[k]),
-            )
+            error = f"{abs(learned[k] - true[k]):.1e}"
+            table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error, *_told(told[k]))
     learned, true = mass_ratios(system), mass_ratios(truth)
+    told = found.mass_ratio or [None] * (len(true) - 1)
     for k in range(1, len(true)):
-        error = abs(learned[k] / true[k] - 1)
-        table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", f"{error:.1e} rel", "")
+        error = f"{abs(learned[k] / true[k] - 1):.1e} rel"
+        table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error, *_told(told[k - 1]))
     return table
+
+
+def _told(estimate: Estimate | None) -> tuple[str, str, str]:
+    """How many impacts speak about a quantity, its value with half of its 95 % interval, and the verdict."""
+    if estimate is None:
+        return "", "", ""
+    impacts = "" if estimate.impacts is None else str(estimate.impacts)
+    interval = f"{estimate.value:.4f} +- {1.96 * estimate.standard_error:.1g}"
+    if estimate.verdict in ("identified", "not identified"):
+        return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
+    return (
+        impacts,
+        "",
+        f">= {estimate.bound:.3f}" if estimate.verdict == "bounded below" else f"<= {estimate.bound:.3f}",
+    )
 
 
 MEASURES = {

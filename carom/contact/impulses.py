@@ -28,10 +28,14 @@ class ContactState(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """What a contact model answers: the change of the points' velocities, and its relative residual."""
+    """What a contact model answers: the change of the points' velocities, and its relative residual.
+
+    `impulse` (N s): of each contact in the contact frame, in compression and rebound or at once, if the model has any.
+    """
 
     velocity: Float[Array, "n d"]
     residual: Float[Array, ""]
+    impulse: Float[Array, "phases K d"] | None = None
 
 
 class ContactModel(eqx.Module):
@@ -49,9 +53,11 @@ class CM(ContactModel):
         compression, rebound = two_phases(
             state.delassus, state.velocity, state.friction, state.restitution, state.target, smoothing=smoothing
         )
-        impulse = (compression.impulse + rebound.impulse).reshape(-1)
+        impulse = jnp.stack([compression.impulse, rebound.impulse])
         return Jump(
-            jnp.einsum("rid,r->id", state.response, impulse), jnp.maximum(compression.residual, rebound.residual)
+            jnp.einsum("rid,r->id", state.response, impulse.sum(axis=0).reshape(-1)),
+            jnp.maximum(compression.residual, rebound.residual),
+            impulse,
         )
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
-from carom.contact.impulses import ContactState, target_velocity
+from carom.contact.candidates import Active
+from carom.contact.impulses import ContactState, Jump, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
@@ -80,14 +81,14 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
     return impact(system, x, v, inverse_mass, stepper)
 
 
-def impact(
+def contact_jump(
     system: System,
     x: Float[Array, "n d"],
     v: Float[Array, "n d"],
     inverse_mass: Float[Array, "n n"],
     stepper: Stepper,
-) -> StepResult:
-    """Let the contacts that are closed at `x` change the velocity (S.8 to S.15)."""
+) -> tuple[Active, Jump]:
+    """The contacts that are closed at `x`, and how they change the velocity (S.8 to S.15)."""
     active = system.active(x)
     k, d = active.jacobian.shape[:2]
     rows = active.jacobian.reshape(k * d, system.n_points, d)
@@ -117,6 +118,18 @@ def impact(
         ),
         smoothing=stepper.smoothing,
     )
+    return active, jump
+
+
+def impact(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+) -> StepResult:
+    """Let the contacts that are closed at `x` change the velocity."""
+    active, jump = contact_jump(system, x, v, inverse_mass, stepper)
     return StepResult(
         x=x, v=v + jump.velocity, contact=jnp.any(active.active), overflow=active.overflow, residual=jump.residual
     )
