@@ -5,10 +5,9 @@ import dataclasses
 from rich.console import Console
 
 from carom.cli.arguments import FilePath, RunPath
-from carom.cli.learn import TEST_DATA, pictures
+from carom.cli.learn import TEST_DATA, pictures, what_is_told
 from carom.cli.tables import evaluation_table, property_table
 from carom.learning.evaluate import evaluate
-from carom.learning.identify import identify
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
 from carom.simulation.files import load_recording
@@ -43,18 +42,11 @@ class Evaluate:
         system = load_model_into(run.path / MODEL, truth)
         test = load_recording(self.data or run.path / TEST_DATA, task=name)
         measures, predicted = evaluate(system, test, truth=truth, formulation=header["formulation"])
-        found = identify(
-            system,
-            test,
-            learned=config["learn"],
-            formulation=header["formulation"],
-            compensation_steps=config["compensation_steps"],
-            project=config["project"],
-        )
-        told = dataclasses.asdict(found)
+        console = Console()
+        found = what_is_told(system, test, config, console)
+        told = found and dataclasses.asdict(found)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         pictures(run, system, test, predicted)
-        console = Console()
         console.print(property_table(system, truth, found))
         console.print(evaluation_table(measures))
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

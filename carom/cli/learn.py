@@ -15,7 +15,7 @@ from carom.cli.arguments import FilePath, FolderPath, TaskName
 from carom.cli.tables import evaluation_table, property_table
 from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
-from carom.learning.identify import identify
+from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
 from carom.learning.train import FORMULATIONS, LearnConfig, LearnReport, learn, quantities
@@ -157,21 +157,13 @@ class Learn:
         formulation = FORMULATIONS[self.config.model]
         save_model(run.path / MODEL, system, formulation=formulation)
         measures, predicted = evaluate(system, test, truth=truth, formulation=formulation)
-        console.print("Finding what the data can tell ...", highlight=False)
-        found = identify(
-            system,
-            dataset.train,
-            learned=self.config.learn,
-            formulation=formulation,
-            compensation_steps=self.config.compensation_steps,
-            project=self.config.project,
-        )
+        found = what_is_told(system, dataset.train, dataclasses.asdict(self.config), console)
         run.write_json(
             REPORT,
             {
                 "learned": dataclasses.asdict(report),
                 "evaluation": measures,
-                "identification": dataclasses.asdict(found),
+                "identification": found and dataclasses.asdict(found),
             },
         )
         console.print(property_table(system, truth, found))
@@ -196,6 +188,24 @@ def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
     order = np.random.default_rng((seed, 2)).permutation(n)
     count = max(1, round(n / 10))
     return data.select(np.sort(order[count:])), data.select(np.sort(order[:count]))
+
+
+def what_is_told(
+    system: System, recording: Recording, config: dict[str, Any], console: Console
+) -> Identification | None:
+    """What the recording tells of the properties of a system learned with `config`; None if the system is too large."""
+    if system.n_points > MOST_POINTS:
+        console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
+        return None
+    console.print("Finding what the data can tell ...", highlight=False)
+    return identify(
+        system,
+        recording,
+        learned=config["learn"],
+        formulation=FORMULATIONS[config["model"]],
+        compensation_steps=config["compensation_steps"],
+        project=config["project"],
+    )
 
 
 def pictures(run: RunFolder, system: System, test: Recording, predicted: Trajectory) -> None:

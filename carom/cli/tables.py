@@ -21,42 +21,45 @@ def property_names(system: System) -> list[str]:
     ]
 
 
-def property_table(system: System, truth: System, found: Identification) -> Table:
-    """Learned and true friction, restitution and mass ratios, with errors, and what the data tell of each."""
+def property_table(system: System, truth: System, found: Identification | None) -> Table:
+    """Learned and true friction, restitution and mass ratios, with errors, and what the data tell of each, if known.
+
+    `impacts` are all of the data, `telling` those looked at on which the quantity has an effect.
+    """
     table = Table(title="Learned and true")
     for name in ("quantity", "of"):
         table.add_column(name)
-    for name in ("true", "learned", "error", "impacts", "refined +- 95 %"):
+    for name in ("true", "learned", "error", "impacts", "telling", "refined +- 95 %"):
         table.add_column(name, justify="right")
     table.add_column("told")
     names = property_names(system)
     for quantity in ("friction", "restitution"):
         learned, true = np.asarray(getattr(system, quantity)), np.asarray(getattr(truth, quantity))
-        told = getattr(found, quantity) or [None] * len(names)
+        told = getattr(found, quantity, None) or [None] * len(names)
+        impacts = [str(count) for count in found.impacts] if found else [""] * len(names)
         for k, name in enumerate(names):
             error = f"{abs(learned[k] - true[k]):.1e}"
-            table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error, *_told(told[k]))
+            table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error, impacts[k], *_told(told[k]))
     learned, true = mass_ratios(system), mass_ratios(truth)
-    told = found.mass_ratio or [None] * (len(true) - 1)
+    told = getattr(found, "mass_ratio", None) or [None] * (len(true) - 1)
     for k in range(1, len(true)):
         error = f"{abs(learned[k] / true[k] - 1):.1e} rel"
-        table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error, *_told(told[k - 1]))
+        row = ("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error, "")
+        table.add_row(*row, *_told(told[k - 1]))
     return table
 
 
 def _told(estimate: Estimate | None) -> tuple[str, str, str]:
-    """How many impacts speak about a quantity, its value with half of its 95 % interval, and the verdict."""
+    """How many impacts tell of a quantity, its value with half of its 95 % interval, and the verdict."""
     if estimate is None:
         return "", "", ""
     impacts = "" if estimate.impacts is None else str(estimate.impacts)
+    if estimate.verdict == "bounded below":
+        return impacts, "", f">= {estimate.bound:.3f}"
+    if estimate.verdict == "bounded above":
+        return impacts, "", f"<= {estimate.bound:.3f}"
     interval = f"{estimate.value:.4f} +- {1.96 * estimate.standard_error:.1g}"
-    if estimate.verdict in ("identified", "not identified"):
-        return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
-    return (
-        impacts,
-        "",
-        f">= {estimate.bound:.3f}" if estimate.verdict == "bounded below" else f"<= {estimate.bound:.3f}",
-    )
+    return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
 
 
 MEASURES = {

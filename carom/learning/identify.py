@@ -1,19 +1,21 @@
 """What the data can tell: a standard error and a verdict for every contact property and mass ratio.
 
-The estimator. Each recorded step that does not start in contact gives a residual `r = F(y_k) - y_(k+1)`, predicted
-minus recorded state. Recorded states are taken as true ones with independent errors of covariance `Sigma`, one size for
-each point's positions and one for its velocities, found from the steps without contact (for exact data they are those
-of the network). To first order, `r` then has the covariance `C = Sigma + F' Sigma F'^T`, by which it is whitened: the
-"effective variance" form of least squares with errors in both variables (Fuller, *Measurement Error Models*, 1987,
-section 3.2). It matters: an error of 1 mm in a position turns the normal of an impact, and moves the velocity after it,
-by far more than velocities err. Steps in which a gap, before or after, is closed or open by less than `doubt` standard
-deviations are left out, because there errors decide which contacts act. What is left is minimised by the robust
+The estimator. The trainer's values are not an optimum with a theory (it minimises nearly absolute errors in small
+batches, and stops early), so standard errors belong to an estimator of their own, which starts from them. Each recorded
+step that does not start in contact gives a residual `r = F(y_k) - y_(k+1)`, predicted minus recorded state. Recorded
+states are taken as true ones with independent errors of covariance `Sigma`, one size for each point's positions and one
+for its velocities, found from the steps without contact (for exact data they are those of the network). To first order,
+`r` then has the covariance `C = Sigma + F' Sigma F'^T`, by which it is whitened: the "effective variance" form of least
+squares with errors in both variables (Fuller, *Measurement Error Models*, 1987, section 3.2). It matters: an error of
+1 mm in a position turns the normal of an impact, and moves the velocity after it, by far more than velocities err.
+Steps in which a gap, before or after, is closed or open by less than `doubt` standard deviations are left out, because
+there errors decide which contacts act. What is left is minimised by the robust
 estimator of `robust.py`, from the learned values on, clustered by trajectory.
 
 A neural potential is profiled out: the weights of its output layer are estimated along with the physical parameters
 (along the principal directions of the forces they can make), so that standard errors hold what masses and forces can
-trade; its other layers are held. The values reported are this estimator's (`refined`), not the trainer's, which
-minimises nearly absolute errors, stops early, and has no such theory.
+trade; its other layers are held. The values reported
+(`refined`) are this estimator's.
 
 Friction is told by impacts that slide: a contact that sticks only says that its friction is at least the ratio of
 tangential to normal impulse that held it. Restitution is told by impacts whose rebound it decides: where the contact
@@ -41,13 +43,15 @@ from carom.simulation.rollout import COMPENSATION_STEPS, Stepper
 from carom.system import System
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified"]
+MOST_POINTS = 40
+"""Largest system that `identify` takes: derivatives of a step by the state before it grow with the cube of its size."""
 SMALLEST_ERROR = 1e-6
 """No standard error is reported smaller than this: the contact solver's own accuracy."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """One quantity: `impacts` that speak about it (None for masses); `lower`, `upper`: its 95 % interval.
+    """One quantity: `impacts` looked at that tell of it (None for masses); `lower`, `upper`: its 95 % interval.
 
     The interval is cut off at mu = 0, e = 0 and e = 1. `bound` is the one that contacts set which stick, or rebound by
     more than their restitution (see the top of this file), where there is no better information.
@@ -95,9 +99,13 @@ def identify(
     **Arguments:** `system`, a learned one: its values are where the estimator starts; `recording`, the data it was
     learned from, or others; `learned`, what was unknown; the rest as in `LearnConfig`.
 
-    **Raises:** `CaromError` if no step starts without contact.
+    **Raises:** `CaromError` if no step starts without contact, or the system has more than `MOST_POINTS` points.
     """
     config = IdentifyConfig() if config is None else config
+    require(
+        system.n_points <= MOST_POINTS,
+        f"identify is for systems of up to {MOST_POINTS} points; this one has {system.n_points}.",
+    )
     require(
         recording.x.shape[2:] == (system.n_points, system.dim),
         f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {system.n_points} in "
