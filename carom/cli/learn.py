@@ -13,6 +13,7 @@ import carom
 from carom.checks import require
 from carom.cli.arguments import FilePath, FolderPath, TaskName
 from carom.cli.tables import evaluation_table, property_table
+from carom.learning.baselines import BASELINES
 from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
@@ -193,7 +194,12 @@ def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
 def what_is_told(
     system: System, recording: Recording, config: dict[str, Any], console: Console
 ) -> Identification | None:
-    """What the recording tells of the properties of a system learned with `config`; None if the system is too large."""
+    """What the recording tells of the properties of a system learned with `config`.
+
+    None for a baseline, which has no properties, and for a system that is too large.
+    """
+    if config["model"] in BASELINES:
+        return None
     if system.n_points > MOST_POINTS:
         console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
         return None
@@ -215,6 +221,7 @@ def pictures(run: RunFolder, system: System, test: Recording, predicted: Traject
     metrics = run.metrics()
     if metrics:
         figures.learning_curves(metrics, run.path / "learning_curves.png")
+    if metrics and metrics[-1]["friction"]:
         figures.contact_properties(metrics, run.read_json(TRUTH), run.path / "contact_properties.png")
     relative, _ = state_errors(test, predicted)
     figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")

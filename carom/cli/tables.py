@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from carom.learning.baselines import physical_quantities
 from carom.learning.identify import Estimate, Identification
 from carom.learning.models import mass_ratios
 from carom.system import System
@@ -33,7 +34,8 @@ def property_table(system: System, truth: System, found: Identification | None) 
         table.add_column(name, justify="right")
     table.add_column("told")
     names = property_names(system)
-    for quantity in ("friction", "restitution"):
+    has = physical_quantities(system)
+    for quantity in (name for name in ("friction", "restitution") if name in has):
         learned, true = np.asarray(getattr(system, quantity)), np.asarray(getattr(truth, quantity))
         told = getattr(found, quantity, None) or [None] * len(names)
         impacts = [str(count) for count in found.impacts] if found else [""] * len(names)
@@ -42,7 +44,7 @@ def property_table(system: System, truth: System, found: Identification | None) 
             table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error, impacts[k], *_told(told[k]))
     learned, true = mass_ratios(system), mass_ratios(truth)
     told = getattr(found, "mass_ratio", None) or [None] * (len(true) - 1)
-    for k in range(1, len(true)):
+    for k in range(1, len(true) if "mass" in has else 1):
         error = f"{abs(learned[k] / true[k] - 1):.1e} rel"
         row = ("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error, "")
         table.add_row(*row, *_told(told[k - 1]))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
+from carom.learning.baselines import describe_baseline, rebuild_baseline
 from carom.learning.models import NeuralPotential
 from carom.system import System
 
@@ -33,6 +34,7 @@ def save_model(path: str | Path, system: System, *, formulation: str = "lagrangi
         "points": system.n_points,
         "dim": system.dim,
         "network": None,
+        "baseline": describe_baseline(system),
         "sha256": hashlib.sha256(payload).hexdigest(),
     }
     if isinstance(system.potential, NeuralPotential):
@@ -72,6 +74,8 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
             key=jax.random.key(0),
         )
         skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)
+    if header.get("baseline") is not None:
+        skeleton = rebuild_baseline(header["baseline"], skeleton)
     try:
         return eqx.tree_deserialise_leaves(io.BytesIO(payload), skeleton)
     except (RuntimeError, ValueError, EOFError, TypeError) as error:
