@@ -10,6 +10,7 @@ import pytest
 from systems import ball_on_floor, refused, two_bodies
 
 import carom
+from carom.contact.impulses import ContactModel, Jump
 from carom.learning.baselines import (
     BASELINES,
     InteractionContact,
@@ -124,7 +125,7 @@ def test_bodies_without_contacts_or_constraints_move_alone():
 def test_training_steps_are_finite_and_lower_the_loss(task, name):
     """On one batch of half smooth, half contact steps."""
     system = carom.task(task)
-    data = carom.make_recording(system, jax.random.key(0), 16)
+    data = carom.make_recording(with_baseline(system, Reversal()), jax.random.key(0), 16)
     config = carom.LearnConfig(model=name, width=32, depth=2)
     state, optimizer = fresh_state(system, config, 1000)
     drawn = Chunks.of(data.contact, data.length, config.states).draw(np.random.default_rng(0), 32, 0.5)
@@ -157,10 +158,10 @@ def test_a_baseline_has_only_the_unknowns_it_uses():
 @pytest.mark.slow
 @pytest.mark.ci_budget
 def test_a_baseline_is_learned_evaluated_and_saved(tmp_path):
-    truth = ball_on_floor(restitution=0.8)
+    truth = ball_on_floor()
     x0 = jnp.array([[[0.1 * k, 0.12 + 0.02 * k]] for k in range(12)])
     v0 = jnp.broadcast_to(jnp.array([[0.5, -1.0]]), x0.shape)
-    data = carom.recording_of(carom.simulate(truth, x0, v0, dt=0.01, steps=30))
+    data = carom.recording_of(carom.simulate(with_baseline(truth, Reversal()), x0, v0, dt=0.01, steps=30))
     config = carom.LearnConfig(
         model="mlp-cd-clnn", epochs=6, chunks_per_epoch=64, batch_size=32, width=16, depth=1, checkpoint_every=10
     )

@@ -58,7 +58,9 @@ class Graph(eqx.Module):
             for kind, candidate, bodies in named
             for a, b in (itertools.permutations(bodies, 2) if len(bodies) > 1 else [(WORLD, bodies[0])])
         ]
-        kind, candidate, sender, receiver = zip(*relations, strict=True) if relations else ((), (), (), ())
+        kind, candidate, sender, receiver = (
+            (tuple(part) for part in zip(*relations, strict=True)) if relations else ((),) * 4
+        )
         return cls(
             points=tuple(map(tuple, points.tolist())),
             owner=owner,
