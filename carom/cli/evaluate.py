@@ -6,7 +6,7 @@ from rich.console import Console
 
 from carom.cli.arguments import FilePath, RunPath
 from carom.cli.learn import TEST_DATA, pictures, what_is_told
-from carom.cli.tables import evaluation_table, property_table
+from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
@@ -47,6 +47,8 @@ class Evaluate:
         told = found and dataclasses.asdict(found)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         pictures(run, system, test, predicted)
-        console.print(property_table(system, truth, found))
+        console.print(property_table(system, truth))
+        if found is not None:
+            console.print(told_table(system, found))
         console.print(evaluation_table(measures))
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

@@ -12,7 +12,7 @@ from rich.console import Console
 import carom
 from carom.checks import require
 from carom.cli.arguments import FilePath, FolderPath, TaskName
-from carom.cli.tables import evaluation_table, property_table
+from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.learning.baselines import BASELINES
 from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
@@ -167,7 +167,9 @@ class Learn:
                 "identification": found and dataclasses.asdict(found),
             },
         )
-        console.print(property_table(system, truth, found))
+        console.print(property_table(system, truth))
+        if found is not None:
+            console.print(told_table(system, found))
         console.print(evaluation_table(measures))
         if report.skipped_steps or report.overflowed_contacts:
             console.print(

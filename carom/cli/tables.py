@@ -22,39 +22,49 @@ def property_names(system: System) -> list[str]:
     ]
 
 
-def property_table(system: System, truth: System, found: Identification | None) -> Table:
-    """Learned and true friction, restitution and mass ratios, with errors, and what the data tell of each, if known.
-
-    `impacts` are all of the data, `telling` those looked at on which the quantity has an effect.
-    """
+def property_table(system: System, truth: System) -> Table:
+    """Learned and true friction, restitution and mass ratios, with errors; those that the system has."""
     table = Table(title="Learned and true")
     for name in ("quantity", "of"):
         table.add_column(name)
-    for name in ("true", "learned", "error", "impacts", "telling", "refined +- 95 %"):
+    for name in ("true", "learned", "error"):
         table.add_column(name, justify="right")
-    table.add_column("told")
     names = property_names(system)
     has = physical_quantities(system)
     for quantity in (name for name in ("friction", "restitution") if name in has):
         learned, true = np.asarray(getattr(system, quantity)), np.asarray(getattr(truth, quantity))
-        told = getattr(found, quantity, None) or [None] * len(names)
-        impacts = [str(count) for count in found.impacts] if found else [""] * len(names)
         for k, name in enumerate(names):
             error = f"{abs(learned[k] - true[k]):.1e}"
-            table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error, impacts[k], *_told(told[k]))
+            table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error)
     learned, true = mass_ratios(system), mass_ratios(truth)
-    told = getattr(found, "mass_ratio", None) or [None] * (len(true) - 1)
     for k in range(1, len(true) if "mass" in has else 1):
         error = f"{abs(learned[k] / true[k] - 1):.1e} rel"
-        row = ("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error, "")
-        table.add_row(*row, *_told(told[k - 1]))
+        table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error)
     return table
 
 
-def _told(estimate: Estimate | None) -> tuple[str, str, str]:
+def told_table(system: System, found: Identification) -> Table:
+    """What the data tell of each quantity that was learned.
+
+    `impacts` are all of the data, `telling` those looked at on which the quantity has an effect.
+    """
+    table = Table(title="What the data tell")
+    for name in ("quantity", "of"):
+        table.add_column(name)
+    for name in ("impacts", "telling", "refined +- 95 %"):
+        table.add_column(name, justify="right")
+    table.add_column("told")
+    names, impacts = property_names(system), [str(count) for count in found.impacts]
+    for quantity in ("friction", "restitution"):
+        for name, count, estimate in zip(names, impacts, getattr(found, quantity), strict=False):
+            table.add_row(quantity, name, count, *_told(estimate))
+    for k, estimate in enumerate(found.mass_ratio, 1):
+        table.add_row("mass ratio", f"{k} to 0", "", *_told(estimate))
+    return table
+
+
+def _told(estimate: Estimate) -> tuple[str, str, str]:
     """How many impacts tell of a quantity, its value with half of its 95 % interval, and the verdict."""
-    if estimate is None:
-        return "", "", ""
     impacts = "" if estimate.impacts is None else str(estimate.impacts)
     if estimate.verdict == "bounded below":
         return impacts, "", f">= {estimate.bound:.3f}"

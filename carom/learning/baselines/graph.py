@@ -56,11 +56,9 @@ class Graph(eqx.Module):
         relations = [
             (kind, candidate, a, b)
             for kind, candidate, bodies in named
-            for a, b in (itertools.permutations(bodies, 2) if len(bodies) > 1 else [(WORLD, bodies[0])])
+            for a, b in (itertools.permutations(bodies, 2) if len(bodies) > 1 else ((WORLD, k) for k in bodies))
         ]
-        kind, candidate, sender, receiver = (
-            (tuple(part) for part in zip(*relations, strict=True)) if relations else ((),) * 4
-        )
+        kind, candidate, sender, receiver = list(zip(*relations, strict=True)) or [()] * 4
         return cls(
             points=tuple(map(tuple, points.tolist())),
             owner=owner,
