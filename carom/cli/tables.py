@@ -55,7 +55,7 @@ def told_table(system: System, found: Identification) -> Table:
         table.add_column(name, justify="right")
     table.add_column("told")
     names, impacts = property_names(system), [str(count) for count in found.impacts]
-    for quantity in ("friction", "restitution"):
+    for quantity in ("friction", "restitution"):  # no estimates of one that was not learned
         for name, count, estimate in zip(names, impacts, getattr(found, quantity), strict=False):
             table.add_row(quantity, name, count, *_told(estimate))
     for k, estimate in enumerate(found.mass_ratio, 1):
