@@ -25,7 +25,7 @@ def training(request):
     """The arguments of a training step, with contact."""
     system = carom.task(request.param)
     data = carom.make_recording(system, jax.random.key(0), 200)
-    chunks = Chunks.of(data.contact, data.length, CONFIG.chunk_length)
+    chunks = Chunks.of(data.contact, data.length, CONFIG.states)
     drawn = chunks.draw(np.random.default_rng(0), CONFIG.batch_size, CONFIG.contact_share)
     skeleton = system.with_max_active(int(closed_contacts(data.x, system).max()) + 2)
     unknowns = initial_unknowns(skeleton, CONFIG)
@@ -33,7 +33,7 @@ def training(request):
     with jax.numpy_dtype_promotion("standard"):
         state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
     inputs = (skeleton, jnp.asarray(data.x), jnp.asarray(data.v), *(jnp.asarray(part) for part in drawn))
-    with_contact = float(np.mean(np.any(gather_chunks(data.contact, data.contact, *drawn, CONFIG.chunk_length)[0], 1)))
+    with_contact = float(np.mean(np.any(gather_chunks(data.contact, data.contact, *drawn, CONFIG.states)[0], 1)))
     return request.param, inputs, unknowns, state, optimizer, with_contact
 
 
@@ -44,9 +44,7 @@ def test_training_step(benchmark, training, contact):
     width = jnp.asarray(0.1)
 
     def run():
-        return jax.block_until_ready(
-            train_step(inputs, unknowns, state, optimizer, stepper, CONFIG.chunk_length, width)[2]
-        )
+        return jax.block_until_ready(train_step(inputs, unknowns, state, optimizer, stepper, CONFIG.states, width)[2])
 
     run()
     benchmark.group = f"training step, {name}, {share:.0%} of the chunks with a contact"

@@ -18,8 +18,12 @@ from .errors import CaromError as CaromError
 from .learning.dataset import Dataset as Dataset
 from .learning.dataset import recording_of as recording_of
 from .learning.evaluate import evaluate as evaluate
+from .learning.identify import Estimate as Estimate
+from .learning.identify import Identification as Identification
+from .learning.identify import identify as identify
 from .learning.model_file import save_model as save_model
 from .learning.models import NeuralPotential as NeuralPotential
+from .learning.refine import IdentifyConfig as IdentifyConfig
 from .learning.train import LearnConfig as LearnConfig
 from .learning.train import LearnReport as LearnReport
 from .learning.train import learn as learn

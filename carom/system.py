@@ -1,5 +1,6 @@
 """The System: bodies, constraints, contacts, potential and contact properties in one pytree."""
 
+import abc
 import dataclasses
 from collections.abc import Sequence
 
@@ -23,6 +24,16 @@ from carom.mechanics.constraints import Constraint, Rigid
 from carom.mechanics.potentials import NoPotential, Potential
 
 
+class StepModel(eqx.Module):
+    """A law for a whole time step, in place of the equations of motion and the contact model: a network, say."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, system: "System", x: Float[Array, "n d"], v: Float[Array, "n d"], dt: Float[Array, ""]
+    ) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+        """Positions (m) and velocities (m/s) after a step of `dt` (s)."""
+
+
 class System(eqx.Module):
     """A mechanical system with contact. True and learned systems are the same type.
 
@@ -37,6 +48,7 @@ class System(eqx.Module):
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
       candidates, or twice as many as points where that is less: more are an error, never dropped.
     - `contact_model`: how closed contacts change the velocity: `"cm"`, `"cmr"`, `"lcp"`, or a `ContactModel`.
+    - `step_model`: a law for a whole step that replaces forces, constraints and the contact model; none by default.
     - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
     - `name`: the task's name, for a task's system.
 
@@ -53,6 +65,7 @@ class System(eqx.Module):
     friction: Float[Array, " P"]
     restitution: Float[Array, " P"]
     contact_model: ContactModel
+    step_model: StepModel | None
     dim: int = eqx.field(static=True)
     max_active: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
@@ -67,6 +80,7 @@ class System(eqx.Module):
         restitution: ArrayLike = 0.0,
         *,
         contact_model: str | ContactModel = "cm",
+        step_model: StepModel | None = None,
         max_active: int | None = None,
         dim: int | None = None,
         name: str = "",
@@ -75,6 +89,7 @@ class System(eqx.Module):
         self.bodies, self.contacts, self.name = tuple(bodies), tuple(contacts), name
         self.potential = NoPotential() if potential is None else potential
         self.contact_model = contact_model_of(contact_model)
+        self.step_model = step_model
         self.dim = _dimension(self.bodies, self.contacts, self.potential, dim)
         table = self.table
         rigid = [

@@ -85,7 +85,7 @@ def test_learn_writes_a_whole_run_folder(learned):
     assert (config["task"], config["epochs"], config["model"]) == ("cp3", 2, "clnn")
     assert [m["epoch"] for m in RunFolder.open(learned).metrics()] == [1, 2]
     report = json.loads((learned / "report.json").read_text())
-    assert set(report) == {"learned", "evaluation", "touches"}
+    assert set(report) == {"learned", "evaluation", "identification"}
     with Image.open(learned / "prediction.gif") as animation:
         assert animation.n_frames > 20
     assert carom.load_model(learned / "model.carom").friction.tolist() == report["learned"]["friction"]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import carom
-from carom.learning.dataset import Chunks, Dataset, contact_flags, count_touches, recording_of, trajectory_of
+from carom.learning.dataset import Chunks, Dataset, closing, contact_flags, recording_of, trajectory_of
 
 
 def recording(n=4, times=12, contact=None, dt=0.01, points=1):
@@ -46,7 +46,7 @@ def test_flags_are_recorded_or_found_from_gaps():
     x[1, 2, 0, 1] = 0.05
     data = carom.Recording.of(x, np.zeros_like(x), dt=0.1)
     assert np.argwhere(contact_flags(data, floor)).tolist() == [[1, 2]]
-    assert count_touches(data, floor).tolist() == [1]
+    assert closing(data, floor).tolist() == [1]
     flagged = carom.Recording.of(x, np.zeros_like(x), dt=0.1, contact=np.ones((2, 3), bool))
     assert contact_flags(flagged, floor).all()
 

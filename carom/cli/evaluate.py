@@ -5,9 +5,8 @@ import dataclasses
 from rich.console import Console
 
 from carom.cli.arguments import FilePath, RunPath
-from carom.cli.learn import TEST_DATA, pictures
-from carom.cli.tables import evaluation_table, property_table
-from carom.learning.dataset import count_touches
+from carom.cli.learn import TEST_DATA, pictures, what_is_told
+from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
@@ -18,6 +17,8 @@ from carom.tasks import task
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
     """Measure a learned model: contact properties, mass ratios, trajectory error, energy, constraints.
+
+    What the data can tell of each property is of the test data here, in `carom learn` of the training data.
 
     Writes evaluation.json and pictures into the run folder.
     """
@@ -34,7 +35,8 @@ class Evaluate:
     def run(self) -> None:
         """Do it."""
         run = RunFolder.open(self.run_folder)
-        name = run.read_json(CONFIG)["task"]
+        config = run.read_json(CONFIG)
+        name = config["task"]
         truth = task(name)
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, truth)
@@ -46,9 +48,13 @@ class Evaluate:
             formulation=header["formulation"],
             compensation_steps=header["compensation_steps"],
         )
-        run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
-        pictures(run, system, test, predicted)
         console = Console()
-        console.print(property_table(system, truth, count_touches(test, truth)))
+        found = what_is_told(system, test, config, console)
+        told = found and dataclasses.asdict(found)
+        run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
+        pictures(run, system, test, predicted)
+        console.print(property_table(system, truth))
+        if found is not None:
+            console.print(told_table(system, found))
         console.print(evaluation_table(measures))
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

@@ -12,10 +12,12 @@ from rich.console import Console
 import carom
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, TaskName
-from carom.cli.tables import evaluation_table, property_table
+from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.contact.impulses import contact_model_of
-from carom.learning.dataset import Dataset, count_touches, trajectory_of
+from carom.learning.baselines import BASELINES
+from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
+from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
 from carom.learning.train import FORMULATIONS, LearnConfig, LearnReport, learn, quantities
@@ -170,12 +172,18 @@ class Learn:
         measures, predicted = evaluate(
             system, test, truth=truth, formulation=formulation, compensation_steps=compensation
         )
-        touches = count_touches(dataset.train, truth)
+        found = what_is_told(system, dataset.train, dataclasses.asdict(self.config), console)
         run.write_json(
             REPORT,
-            {"learned": dataclasses.asdict(report), "evaluation": measures, "touches": touches.tolist()},
+            {
+                "learned": dataclasses.asdict(report),
+                "evaluation": measures,
+                "identification": found and dataclasses.asdict(found),
+            },
         )
-        console.print(property_table(system, truth, touches))
+        console.print(property_table(system, truth))
+        if found is not None:
+            console.print(told_table(system, found))
         console.print(evaluation_table(measures))
         if report.skipped_steps or report.overflowed_contacts:
             console.print(
@@ -199,6 +207,29 @@ def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
     return data.select(np.sort(order[count:])), data.select(np.sort(order[:count]))
 
 
+def what_is_told(
+    system: System, recording: Recording, config: dict[str, Any], console: Console
+) -> Identification | None:
+    """What the recording tells of the properties of a system learned with `config`.
+
+    None for a baseline, which has no properties, and for a system that is too large.
+    """
+    if config["model"] in BASELINES:
+        return None
+    if system.n_points > MOST_POINTS:
+        console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
+        return None
+    console.print("Finding what the data can tell ...", highlight=False)
+    return identify(
+        system,
+        recording,
+        learned=config["learn"],
+        formulation=FORMULATIONS[config["model"]],
+        compensation_steps=config["compensation_steps"],
+        project=config["project"],
+    )
+
+
 def pictures(run: RunFolder, system: System, test: Recording, predicted: Trajectory) -> None:
     """Draw learning curves, contact properties, error over time, and the animation of one test trajectory."""
     from carom.view import animate, figures  # matplotlib is slow to import
@@ -206,6 +237,7 @@ def pictures(run: RunFolder, system: System, test: Recording, predicted: Traject
     metrics = run.metrics()
     if metrics:
         figures.learning_curves(metrics, run.path / "learning_curves.png")
+    if metrics and metrics[-1]["friction"]:
         figures.contact_properties(metrics, run.read_json(TRUTH), run.path / "contact_properties.png")
     relative, _ = state_errors(test, predicted)
     figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")

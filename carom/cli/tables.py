@@ -6,6 +6,8 @@ import numpy as np
 from rich.table import Table
 
 from carom.contact.impulses import CMr
+from carom.learning.baselines import physical_quantities
+from carom.learning.identify import Estimate, Identification
 from carom.learning.models import mass_ratios
 from carom.system import System
 
@@ -21,35 +23,58 @@ def property_names(system: System) -> list[str]:
     ]
 
 
-def property_table(system: System, truth: System, touches: np.ndarray) -> Table:
-    """Learned and true friction, restitution and mass ratios, with errors.
-
-    `touches` (P,): recorded states in which a contact of each property is closed; few tell little.
-    """
+def property_table(system: System, truth: System) -> Table:
+    """Learned and true friction, restitution and mass ratios, with errors; those that the system has."""
     table = Table(title="Learned and true")
     for name in ("quantity", "of"):
         table.add_column(name)
-    for name in ("true", "learned", "error", "touches"):
+    for name in ("true", "learned", "error"):
         table.add_column(name, justify="right")
     names = property_names(system)
-    for quantity in ("friction", "restitution"):
+    has = physical_quantities(system)
+    for quantity in (name for name in ("friction", "restitution") if name in has):
         learned, true = np.asarray(getattr(system, quantity)), np.asarray(getattr(truth, quantity))
         for k, name in enumerate(names):
-            table.add_row(
-                quantity,
-                name,
-                f"{true[k]:.4f}",
-                f"{learned[k]:.5f}",
-                f"{abs(learned[k] - true[k]):.1e}",
-                str(touches[k]),
-            )
+            error = f"{abs(learned[k] - true[k]):.1e}"
+            table.add_row(quantity, name, f"{true[k]:.4f}", f"{learned[k]:.5f}", error)
     learned, true = mass_ratios(system), mass_ratios(truth)
-    for k in range(1, len(true)):
-        error = abs(learned[k] / true[k] - 1)
-        table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", f"{error:.1e} rel", "")
+    for k in range(1, len(true) if "mass" in has else 1):
+        error = f"{abs(learned[k] / true[k] - 1):.1e} rel"
+        table.add_row("mass ratio", f"{k} to 0", f"{true[k]:.4f}", f"{learned[k]:.5f}", error)
     if isinstance(system.contact_model, CMr):
-        table.add_row("epsilon", "contact model", "", f"{float(system.contact_model.epsilon):.5f}", "", "")
+        table.add_row("epsilon", "contact model", "", f"{float(system.contact_model.epsilon):.5f}", "")
     return table
+
+
+def told_table(system: System, found: Identification) -> Table:
+    """What the data tell of each quantity that was learned.
+
+    `impacts` are all of the data, `telling` those looked at on which the quantity has an effect.
+    """
+    table = Table(title="What the data tell")
+    for name in ("quantity", "of"):
+        table.add_column(name)
+    for name in ("impacts", "telling", "refined +- 95 %"):
+        table.add_column(name, justify="right")
+    table.add_column("told")
+    names, impacts = property_names(system), [str(count) for count in found.impacts]
+    for quantity in ("friction", "restitution"):  # no estimates of one that was not learned
+        for name, count, estimate in zip(names, impacts, getattr(found, quantity), strict=False):
+            table.add_row(quantity, name, count, *_told(estimate))
+    for k, estimate in enumerate(found.mass_ratio, 1):
+        table.add_row("mass ratio", f"{k} to 0", "", *_told(estimate))
+    return table
+
+
+def _told(estimate: Estimate) -> tuple[str, str, str]:
+    """How many impacts tell of a quantity, its value with half of its 95 % interval, and the verdict."""
+    impacts = "" if estimate.impacts is None else str(estimate.impacts)
+    if estimate.verdict == "bounded below":
+        return impacts, "", f">= {estimate.bound:.3f}"
+    if estimate.verdict == "bounded above":
+        return impacts, "", f"<= {estimate.bound:.3f}"
+    interval = f"{estimate.value:.4f} +- {1.96 * estimate.standard_error:.1g}"
+    return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
 
 
 MEASURES = {

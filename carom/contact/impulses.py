@@ -30,10 +30,14 @@ class ContactState(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """What a contact model answers: the change of the points' velocities, and its relative residual."""
+    """What a contact model answers: the change of the points' velocities, and its relative residual.
+
+    `impulse` (N s): of each contact in the contact frame, in compression and rebound or at once, if the model has any.
+    """
 
     velocity: Float[Array, "n d"]
     residual: Float[Array, ""]
+    impulse: Float[Array, "phases K d"] | None = None
 
 
 class ContactModel(eqx.Module):
@@ -108,7 +112,7 @@ class LCP(ContactModel):
         solution = solve_lcp_impulse(
             state.delassus, state.velocity, state.friction, rebound, state.target[:, 1:], facets=self.facets
         )
-        return Jump(_velocity_jump(state, solution.impulse), solution.residual)
+        return Jump(_velocity_jump(state, solution.impulse), solution.residual, solution.impulse[None])
 
 
 CONTACT_MODELS: dict[str, type[ContactModel]] = {"cm": CM, "cmr": CMr, "lcp": LCP}
@@ -151,7 +155,8 @@ def _two_phase_jump(state: ContactState, smoothing: float, diagonal: Float[Array
         smoothing=smoothing,
     )
     residual = jnp.maximum(compression.residual, rebound.residual)
-    return Jump(_velocity_jump(state, compression.impulse + rebound.impulse), residual)
+    velocity = _velocity_jump(state, compression.impulse + rebound.impulse)
+    return Jump(velocity, residual, jnp.stack([compression.impulse, rebound.impulse]))
 
 
 def _velocity_jump(state: ContactState, impulse: Float[Array, "K d"]) -> Float[Array, "n d"]:

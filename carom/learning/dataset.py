@@ -101,23 +101,28 @@ def closed_contacts(x: Float[np.ndarray, "N T n d"], system: System) -> Int[np.n
     """How many contacts of `system` are closed in each recorded state."""
     if not system.contacts:
         return np.zeros(x.shape[:2], int)
-    return np.stack([(gaps < 0).sum(axis=-1) for gaps in _all_gaps(x, system)])
+    return np.stack([(gaps < 0).sum(axis=-1) for gaps in all_gaps(x, system)])
 
 
-def _all_gaps(x: Float[np.ndarray, "N T n d"], system: System) -> Iterator[Float[np.ndarray, "T C"]]:
-    gaps = eqx.filter_jit(lambda s, x: s.gaps(x))
-    return (np.asarray(gaps(system, jnp.asarray(one))) for one in x)
+def all_gaps(x: Float[np.ndarray, "N T n d"], system: System) -> Iterator[Float[np.ndarray, "T C"]]:
+    """Gaps of all contacts, by trajectory."""
+    return (np.asarray(_gaps(system, jnp.asarray(one))) for one in x)
 
 
-def count_touches(recording: Recording, system: System) -> Int[np.ndarray, " P"]:
-    """How many recorded states close a contact of each contact property."""
+@eqx.filter_jit
+def _gaps(system: System, x):
+    return system.gaps(x)
+
+
+def closing(recording: Recording, system: System) -> Int[np.ndarray, " P"]:
+    """How many recorded steps close a contact of each contact property that was open before."""
     out = np.zeros(system.n_properties, int)
     if not system.contacts:
         return out
     index = np.array([p for contact in system.contacts for p in contact.property_index])
-    valid = np.arange(recording.x.shape[1]) < recording.length[:, None]
-    closed = np.concatenate([g[ok] < 0 for g, ok in zip(_all_gaps(recording.x, system), valid, strict=True)])
-    np.add.at(out, index, closed.sum(axis=0))
+    for gaps, length in zip(all_gaps(recording.x, system), recording.length, strict=True):
+        closed = gaps[:length] < 0
+        np.add.at(out, index, (closed[1:] & ~closed[:-1]).sum(axis=0))
     return out
 
 

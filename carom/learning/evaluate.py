@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from carom.checks import require
+from carom.learning.baselines import physical_quantities
 from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
@@ -82,7 +83,8 @@ def evaluate(
       trajectories; `bounded_error`: mean of the bounded form.
     - `energy_drift`: largest `|E - E_0| / max |E|` along predictions of a system that keeps energy, by the true system.
     - `constraint_error`: largest `|Phi|` (m^2).
-    - `friction_error`, `restitution_error` (absolute, by property) and `mass_ratio_error` (relative, by body).
+    - `friction_error`, `restitution_error` (absolute, by property) and `mass_ratio_error` (relative, by body), of
+      a system that has them: a baseline does not.
 
     **Raises:** `CaromError` if the recording is of another system.
     """
@@ -109,9 +111,12 @@ def evaluate(
         "overflowed_contacts": int(np.sum(predicted.overflow)),
     }
     if truth is not None:
-        out["friction_error"] = np.abs(np.asarray(system.friction - truth.friction)).tolist()
-        out["restitution_error"] = np.abs(np.asarray(system.restitution - truth.restitution)).tolist()
-        out["mass_ratio_error"] = np.abs(mass_ratios(system) / mass_ratios(truth) - 1).tolist()
+        known = physical_quantities(system)
+        for name in ("friction", "restitution"):
+            if name in known:
+                out[f"{name}_error"] = np.abs(np.asarray(getattr(system, name) - getattr(truth, name))).tolist()
+        if "mass" in known:
+            out["mass_ratio_error"] = np.abs(mass_ratios(system) / mass_ratios(truth) - 1).tolist()
         if np.all(np.asarray(truth.restitution) == 1) and np.all(np.asarray(truth.friction) == 0):
             energy = np.asarray(truth.energy(predicted.x, predicted.v))
             out["energy_drift"] = float(np.max(np.abs(energy - energy[:, :1])) / np.max(np.abs(energy)))

@@ -14,6 +14,7 @@ from carom.atomic import write_whole
 from carom.checks import require
 from carom.contact.impulses import CONTACT_MODELS, ContactModel, contact_model_name, contact_model_settings
 from carom.errors import CaromError
+from carom.learning.baselines import describe_baseline, rebuild_baseline
 from carom.learning.models import NeuralPotential
 from carom.simulation.rollout import COMPENSATION_STEPS
 from carom.system import System
@@ -49,6 +50,7 @@ def save_model(
             **contact_model_settings(system.contact_model),
         },
         "network": None,
+        "baseline": describe_baseline(system),
         "sha256": hashlib.sha256(payload).hexdigest(),
     }
     if isinstance(system.potential, NeuralPotential):
@@ -91,6 +93,8 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
         )
         skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)
     skeleton = skeleton.with_contact_model(_contact_model(path, header) or skeleton.contact_model)
+    if header.get("baseline") is not None:
+        skeleton = rebuild_baseline(header["baseline"], skeleton)
     try:
         return eqx.tree_deserialise_leaves(io.BytesIO(payload), skeleton)
     except (RuntimeError, ValueError, EOFError, TypeError) as error:

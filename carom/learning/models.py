@@ -7,9 +7,10 @@ import numpy as np
 import optax.projections
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from carom.contact.impulses import ContactModel
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Potential
-from carom.system import System
+from carom.system import StepModel, System
 
 
 class NeuralPotential(Potential):
@@ -46,7 +47,7 @@ class Unknowns(eqx.Module):
 
     Masses are learned as ratios to that of the first body, `mass_i = mass_0 exp(log_mass_ratio_i)`: motion does not
     tell the unit of mass, since masses and potential can be scaled together. A rigid body's moments scale with its
-    mass.
+    mass. `contact_model` and `step_model` are networks of the baselines.
     """
 
     log_mass_ratio: Float[Array, " bodies_after_first"] | None
@@ -54,6 +55,8 @@ class Unknowns(eqx.Module):
     restitution: Float[Array, " P"] | None
     potential: NeuralPotential | None
     log_epsilon: Float[Array, ""] | None = None  # of the contact model CMr: its epsilon is positive, of any magnitude
+    contact_model: ContactModel | None = None
+    step_model: StepModel | None = None
 
     def assemble(self, skeleton: System) -> System:
         """The system with these unknowns filled in."""
@@ -63,10 +66,10 @@ class Unknowns(eqx.Module):
             masses = skeleton.bodies[0].mass * jnp.exp(ratio)
             bodies = tuple(_with_mass(body, mass) for body, mass in zip(skeleton.bodies, masses, strict=True))
             system = eqx.tree_at(lambda s: s.bodies, system, bodies)
-        for name in ("friction", "restitution", "potential"):
+        for name in ("friction", "restitution", "potential", "contact_model", "step_model"):
             value = getattr(self, name)
             if value is not None:
-                system = eqx.tree_at(lambda s, name=name: getattr(s, name), system, value)
+                system = eqx.tree_at(lambda s, name=name: getattr(s, name), system, value, is_leaf=lambda p: p is None)
         if self.log_epsilon is not None:
             system = eqx.tree_at(lambda s: s.contact_model.epsilon, system, jnp.exp(self.log_epsilon))
         return system

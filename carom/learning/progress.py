@@ -37,6 +37,8 @@ class TrainingProgress:
         parts = [f"loss {metrics['loss']:.2e}", f"validation {metrics['val_loss']:.2e}"]
         for name in ("friction", "restitution"):
             values = metrics[name]
+            if not values:  # a network is in its place
+                continue
             mean = sum(values) / max(len(values), 1)
             parts.append(f"{name} {mean:.4f}" if len(values) == 1 else f"mean {name} {mean:.3f}")
         if "epsilon" in metrics:

@@ -74,8 +74,8 @@ class RunFolder:
             raise CaromError(f"{path} is not valid JSON ({error}). Restore the file, or run again.") from error
 
     def write_json(self, name: str, content: Any) -> None:
-        """Write a JSON file of the run."""
-        write_whole(self.path / name, (json.dumps(content, indent=2) + "\n").encode())
+        """Write a JSON file of the run; numbers that are not finite are written as null."""
+        write_whole(self.path / name, (json.dumps(_finite(content), indent=2) + "\n").encode())
 
     # --- metrics ---------------------------------------------------------------------------------------------
 

@@ -13,8 +13,9 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from carom.checks import require
-from carom.contact.impulses import CMr, contact_model_name, contact_model_of
+from carom.contact.impulses import CMr, ContactModel, contact_model_name, contact_model_of
 from carom.errors import CaromError
+from carom.learning.baselines import BASELINES, Baseline, new_baseline, physical_quantities, with_baseline
 from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.progress import TrainingProgress
@@ -22,11 +23,15 @@ from carom.learning.run import RunFolder
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
 from carom.simulation.rollout import COMPENSATION_STEPS, Stepper, check_compensation_steps, step
-from carom.system import System
+from carom.system import StepModel, System
 
-Model = Literal["clnn", "chnn"]
+Model = Literal["clnn", "chnn"] | Baseline
 Quantity = Literal["mass", "friction", "restitution", "potential"]
-FORMULATIONS: dict[Model, Formulation] = {"clnn": "lagrangian", "chnn": "hamiltonian"}
+FORMULATIONS: dict[Model, Formulation] = {
+    "clnn": "lagrangian",
+    "chnn": "hamiltonian",
+    **dict.fromkeys(BASELINES, "lagrangian"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,17 +39,19 @@ class LearnConfig:
     """How to learn. The defaults learn every quantity of the paper's tasks within minutes on two CPU cores."""
 
     model: Model = "clnn"
-    """Constrained Lagrangian (clnn) or Hamiltonian (chnn) neural network."""
+    """Constrained Lagrangian (clnn) or Hamiltonian (chnn) neural network, or a baseline: a network for the contacts
+    (mlp-cd-clnn, in-cp-clnn) or for the whole step (in-cp-sp)."""
     learn: tuple[Quantity, ...] = ("mass", "friction", "restitution", "potential")
-    """What is unknown; all else is taken from the skeleton."""
+    """What is unknown; all else is taken from the skeleton. What a baseline's network replaces is left out."""
     epochs: int = 250
     """How often `chunks_per_epoch` chunks are drawn and learned from."""
     chunks_per_epoch: int = 800
     """Chunks drawn in an epoch, spread evenly over the trajectories."""
     batch_size: int = 200
     """Chunks in a step of the optimiser."""
-    chunk_length: int = 5
-    """Consecutive states in a chunk: the first is given, the others are predicted."""
+    chunk_length: int | None = None
+    """Consecutive states in a chunk: the first is given, the others are predicted. By default 5, and 2 (one step, as in
+    the paper) for a baseline."""
     contact_share: float = 0.5
     """Share of the chunks that are drawn with a contact, where a trajectory has any."""
     learning_rate: float = 3e-3
@@ -58,9 +65,9 @@ class LearnConfig:
     patience: int = 200
     """Stop after so many epochs without a better validation loss."""
     width: int = 256
-    """Units in a hidden layer of the potential."""
+    """Units in a hidden layer of the potential, and of the contact network of mlp-cd-clnn."""
     depth: int = 3
-    """Hidden layers of the potential."""
+    """Hidden layers of the potential, and of the contact network of mlp-cd-clnn."""
     initial_friction: float = 0.3
     """Friction at the start."""
     initial_restitution: float = 0.5
@@ -78,11 +85,18 @@ class LearnConfig:
     checkpoint_every: int = 10
     """Epochs between checkpoints."""
 
+    @property
+    def states(self) -> int:
+        """States in a chunk: `chunk_length`, or its default."""
+        if self.chunk_length is not None:
+            return self.chunk_length
+        return 2 if self.model in BASELINES else 5
+
     def check(self) -> None:
         """Raise `CaromError` for a value that cannot be."""
         for name in ("epochs", "chunks_per_epoch", "batch_size", "patience", "width", "depth", "checkpoint_every"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
-        require(self.chunk_length >= 2, f"chunk_length must be at least 2 states; it was {self.chunk_length}.")
+        require(self.states >= 2, f"chunk_length must be at least 2 states; it was {self.chunk_length}.")
         require(0 <= self.contact_share <= 1, f"contact_share must be in [0, 1]; it was {self.contact_share}.")
         for name in ("learning_rate", "property_learning_rate"):
             require(getattr(self, name) > 0, f"{name} must be positive; it was {getattr(self, name)}.")
@@ -162,9 +176,11 @@ def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
     """
     floats = skeleton.friction.dtype
     count = skeleton.n_properties
+    baseline = initial_baseline(skeleton, config)
+    has = physical_quantities(skeleton if baseline is None else with_baseline(skeleton, baseline))
 
     def chosen(name, value):
-        return value if name in config.learn else None
+        return value if name in config.learn and ("mass" if name == "potential" else name) in has else None
 
     if isinstance(skeleton.potential, NeuralPotential):
         potential = skeleton.potential
@@ -178,6 +194,8 @@ def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
         restitution=chosen("restitution", jnp.full(count, config.initial_restitution, floats)),
         potential=chosen("potential", potential),
         log_epsilon=_initial_log_epsilon(skeleton) if config.epsilon == "learn" else None,
+        contact_model=baseline if isinstance(baseline, ContactModel) else None,
+        step_model=baseline if isinstance(baseline, StepModel) else None,
     )
 
 
@@ -188,19 +206,31 @@ def _initial_log_epsilon(skeleton: System) -> Float[Array, ""]:
     return jnp.log(model.epsilon)
 
 
+def initial_baseline(skeleton: System, config: LearnConfig) -> ContactModel | StepModel | None:
+    """The untrained network of a baseline; None for the others."""
+    if config.model not in BASELINES:
+        return None
+    sizes = {"width": config.width, "depth": config.depth} if config.model == "mlp-cd-clnn" else {}
+    return new_baseline(config.model, skeleton, jax.random.fold_in(jax.random.key(config.seed), 1), **sizes)
+
+
 def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
     """Half a cosine, squared: in late steps the unknowns settle, which takes longer than finding where."""
     return optax.cosine_decay_schedule(config.learning_rate, steps, exponent=2.0)
 
 
 def make_optimizer(config: LearnConfig, steps: int, unknowns: Unknowns) -> optax.GradientTransformation:
-    """AdamW with a decaying rate: weight decay for the network alone, a rate of their own for the properties."""
+    """AdamW with a decaying rate: weight decay for networks alone, a rate of their own for the properties."""
     schedule = learning_rate_schedule(config, steps)
     arrays = eqx.filter(unknowns, eqx.is_inexact_array)
+
+    def networks(u):
+        return u.potential, u.contact_model, u.step_model
+
     is_network = eqx.tree_at(
-        lambda u: u.potential,
+        networks,
         jax.tree.map(lambda _: False, arrays),
-        jax.tree.map(lambda _: True, arrays.potential),
+        jax.tree.map(lambda _: True, networks(arrays)),
         is_leaf=lambda x: x is None,
     )
     is_property = jax.tree.map(lambda flag: not flag, is_network)
@@ -309,8 +339,8 @@ def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> in
         f"{shape[1]}D. Is this a file of another task?",
     )
     require(
-        int(dataset.train.length.max()) >= config.chunk_length,
-        f"chunk_length is {config.chunk_length} states, but the longest training trajectory has "
+        int(dataset.train.length.max()) >= config.states,
+        f"chunk_length is {config.states} states, but the longest training trajectory has "
         f"{int(dataset.train.length.max())}. Use longer trajectories or a shorter chunk.",
     )
     most = 0
@@ -378,7 +408,7 @@ def learn(
     # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
     trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
     train, val = dataset.train, dataset.val
-    chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.chunk_length)
+    chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.states)
     smooth, impact = chunks.count()
     require(smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from.")
     steps = -(-config.chunks_per_epoch // config.batch_size)  # in an epoch
@@ -453,10 +483,10 @@ def learn(
 def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
     """A fixed draw of one batch of chunks, evenly from the validation trajectories."""
     rng = np.random.default_rng((config.seed, 1))
-    chunks = Chunks.of(contact_flags(val, skeleton), val.length, config.chunk_length)
+    chunks = Chunks.of(contact_flags(val, skeleton), val.length, config.states)
     require(sum(chunks.count()) > 0, "the validation data have no chunk that starts without contact.")
     trajectory, start = chunks.draw(rng, config.batch_size, config.contact_share)
-    return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.chunk_length)
+    return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.states)
 
 
 def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, stepper, width, config):
@@ -469,7 +499,7 @@ def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, ste
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
         data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
         unknowns, opt_state, loss, over, bad = train_step(
-            data, unknowns, opt_state, optimizer, stepper, config.chunk_length, width
+            data, unknowns, opt_state, optimizer, stepper, config.states, width
         )
         losses.append(loss)
         overflow, skipped = overflow + over, skipped + bad.astype(skipped.dtype)
@@ -486,11 +516,15 @@ def _keep_best(state: TrainState, val_loss, epoch: int) -> TrainState:
 
 
 def quantities(system: System) -> dict[str, Any]:
-    """The physical quantities of a system, for metrics and reports; epsilon too, of a contact model that has one."""
+    """The physical quantities of a system, for metrics and reports; epsilon too, of a contact model that has one.
+
+    Empty lists for those a network replaces.
+    """
+    has = physical_quantities(system)
     out = {
-        "friction": np.asarray(system.friction).tolist(),
-        "restitution": np.asarray(system.restitution).tolist(),
-        "mass_ratio": mass_ratios(system).tolist(),
+        "friction": np.asarray(system.friction).tolist() if "friction" in has else [],
+        "restitution": np.asarray(system.restitution).tolist() if "restitution" in has else [],
+        "mass_ratio": mass_ratios(system).tolist() if "mass" in has else [],
     }
     if isinstance(system.contact_model, CMr):
         out["epsilon"] = float(system.contact_model.epsilon)

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
-from carom.contact.impulses import ContactModel, ContactState, target_velocity
+from carom.contact.candidates import Active
+from carom.contact.impulses import ContactModel, ContactState, Jump, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
@@ -69,7 +70,15 @@ class StepResult(eqx.Module):
 
 
 def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None) -> StepResult:
-    """Integrate one whole step, then let the contacts act that are closed at its end (the paper's rule)."""
+    """Integrate one whole step, then let the contacts act that are closed at its end (the paper's rule).
+
+    A system with a `step_model` is moved by that alone.
+    """
+    if system.step_model is not None:
+        require(force is None, "force must be None for a system with a step_model: it has no forces.")
+        x, v = system.step_model(system, x, v, stepper.dt)
+        closed = jnp.any(system.gaps(x) < 0)
+        return StepResult(x, v, closed, overflow=jnp.asarray(0), residual=jnp.zeros((), x.dtype))
     inverse_mass = system.inverse_mass_matrix()
     field = FIELDS[stepper.formulation]
 
@@ -88,14 +97,14 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
     return impact(system, x, v, inverse_mass, stepper)
 
 
-def impact(
+def contact_jump(
     system: System,
     x: Float[Array, "n d"],
     v: Float[Array, "n d"],
     inverse_mass: Float[Array, "n n"],
     stepper: Stepper,
-) -> StepResult:
-    """Let the contacts that are closed at `x` change the velocity (S.8 to S.15)."""
+) -> tuple[Active, Jump]:
+    """The contacts that are closed at `x`, and how they change the velocity (S.8 to S.15)."""
     active = system.active(x)
     k, d = active.jacobian.shape[:2]
     rows = active.jacobian.reshape(k * d, system.n_points, d)
@@ -125,6 +134,18 @@ def impact(
         ),
         smoothing=stepper.smoothing,
     )
+    return active, jump
+
+
+def impact(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+) -> StepResult:
+    """Let the contacts that are closed at `x` change the velocity."""
+    active, jump = contact_jump(system, x, v, inverse_mass, stepper)
     return StepResult(
         x=x, v=v + jump.velocity, contact=jnp.any(active.active), overflow=active.overflow, residual=jump.residual
     )

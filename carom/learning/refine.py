@@ -1,0 +1,252 @@
+"""The estimator behind `identify`: which recorded steps it looks at, and how it refines the learned values."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from carom.checks import require
+from carom.learning.dataset import all_gaps
+from carom.learning.models import NeuralPotential, Unknowns
+from carom.learning.robust import Blocks, Solution, solve
+from carom.learning.sensitivity import StepSensitivity, force_features, step_sensitivity
+from carom.simulation.files import Recording
+from carom.simulation.rollout import Stepper
+from carom.system import System
+
+BATCH = 250
+"""Steps that are looked at together."""
+
+
+@dataclasses.dataclass(frozen=True)
+class IdentifyConfig:
+    """What to look at, and what counts as told."""
+
+    impacts: int = 3000
+    """Most steps with a contact to use, shared out over the properties."""
+    smooth_steps: int = 1000
+    """Most steps without contact to use."""
+    rounds: int = 6
+    """Most linearisations of the motion."""
+    doubt: float = 2.0
+    """Steps are left out in which a gap is nearer to zero than so many standard deviations of its error."""
+    min_impacts: int = 10
+    """Fewer impacts that speak about a quantity do not identify it, whatever their standard error."""
+    max_standard_error: float = 0.05
+    """A quantity with a larger standard error (of mass ratios: relative) is not identified."""
+    seed: int = 0
+    """Which steps are used where there are more."""
+
+
+def unknowns_of(system: System, learned: Sequence[str]) -> Unknowns:
+    """The values of a learned system as `Unknowns`."""
+    potential = system.potential if isinstance(system.potential, NeuralPotential) else None
+    return Unknowns(
+        log_mass_ratio=jnp.log(system.masses[1:] / system.masses[0]) if "mass" in learned else None,
+        friction=system.friction if "friction" in learned else None,
+        restitution=system.restitution if "restitution" in learned else None,
+        potential=potential if "potential" in learned else None,
+    )
+
+
+# --- which steps --------------------------------------------------------------------------------------------------
+
+
+def choose_steps(recording: Recording, system: System, config: IdentifyConfig) -> tuple[Int[np.ndarray, "S 2"], int]:
+    """Steps `(trajectory, start)` to look at, and the most contacts closed at once in them.
+
+    None starts in contact. They are chosen by `x + v dt`, which does not look at how they end.
+    """
+    rng = np.random.default_rng(config.seed)
+    dt, P = recording.dt, system.n_properties
+    index = np.array([p for contact in system.contacts for p in contact.property_index], int)
+    touched, smooth, most = [], [], 0
+    ends = all_gaps(recording.x + dt * recording.v, system)
+    for k, (now, then) in enumerate(zip(all_gaps(recording.x, system), ends, strict=True)):
+        open_now, closed = (now >= 0).all(axis=-1), then < 0
+        start = np.flatnonzero(open_now & (np.arange(len(now)) < recording.length[k] - 1))
+        hit = closed[start].any(axis=-1)
+        smooth += [(k, s) for s in start[~hit]]
+        touched += [((k, s), np.unique(index[closed[s]])) for s in start[hit]]
+        most = max(most, int(closed[start].sum(axis=-1).max(initial=0)))
+    require(len(touched) + len(smooth) > 0, "the recording has no step that starts without contact.")
+    by_property = [[n for n, (_, hit) in enumerate(touched) if p in hit] for p in range(P)]
+    seen = sum(bool(steps) for steps in by_property)
+    chosen: set[int] = set()
+    for steps in by_property:
+        chosen.update(rng.permutation(steps)[: config.impacts // max(seen, 1)].astype(int).tolist())
+    free = rng.permutation(len(smooth))[: config.smooth_steps]
+    out = [touched[n][0] for n in sorted(chosen)] + [smooth[n] for n in sorted(free)]
+    return np.array(out, int), most
+
+
+# --- the estimator ------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What is held while the parameters are refined."""
+
+    unknowns: Unknowns
+    skeleton: System
+    stepper: Stepper
+    recording: Recording
+    steps: Int[np.ndarray, "S 2"]
+    features: Float[np.ndarray, "W F"] | None
+
+
+def principal_forces(unknowns: Unknowns, recording: Recording, steps, *, most: int = 100, smallest: float = 1e-5):
+    """The principal directions (W, F) of the forces that the network's output layer can make, None without a network.
+
+    At most `most`, with a root mean square force of at least `smallest` of the largest one's.
+    """
+    if unknowns.potential is None:
+        return None
+    x = jnp.asarray(recording.x[steps[:, 0], steps[:, 1]][:: max(1, len(steps) // 500)])
+    forces = np.asarray(eqx.filter_jit(eqx.filter_vmap(force_features, in_axes=(None, 0)))(unknowns.potential, x))
+    forces = forces.reshape(-1, forces.shape[-1])
+    values, vectors = np.linalg.eigh(forces.T @ forces)
+    return vectors[:, values > smallest**2 * values[-1]][:, -most:]
+
+
+@eqx.filter_jit
+def _sensitivities(unknowns, skeleton, stepper, features, x0, v0, x1, v1):
+    return jax.vmap(lambda a, b, c, d: step_sensitivity(unknowns, skeleton, stepper, features, (a, b), (c, d)))(
+        x0, v0, x1, v1
+    )
+
+
+def sensitivities(problem: Problem, unknowns: Unknowns) -> StepSensitivity:
+    """Of all steps, in batches of a size that hardly depends on their number: each size is a program to compile."""
+    trajectory, start = problem.steps.T
+    count = len(start)
+    size = min(BATCH, 1 << (count - 1).bit_length())
+    features = None if problem.features is None else jnp.asarray(problem.features)
+    x, v = problem.recording.x, problem.recording.v
+    parts = []
+    for first in range(0, count, size):
+        rows = np.arange(first, first + size).clip(max=count - 1)
+        k, s = trajectory[rows], start[rows]
+        states = (jnp.asarray(part) for part in (x[k, s], v[k, s], x[k, s + 1], v[k, s + 1]))
+        out = _sensitivities(unknowns, problem.skeleton, problem.stepper, features, *states)
+        parts.append(out)
+    return jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
+
+
+def refine(problem: Problem, config: IdentifyConfig) -> tuple[Unknowns, Solution, StepSensitivity]:
+    """The parameters of the robust estimator, its last solution, and the steps with their last linearisation."""
+    theta = start = _vector(problem.unknowns)
+    count = len(theta)
+    bias = np.zeros(0 if problem.features is None else problem.features.shape[1])
+    seen = sensitivities(problem, problem.unknowns)
+    errors = error_sizes(seen, problem.recording)
+    kept = beyond_doubt(seen, errors, config.doubt)
+    lower, upper = _bounds(problem.unknowns)
+    free = np.full(len(bias), np.inf)
+    # A prior of standard deviation 1 on all physical parameters, which says nothing where data speak.
+    prior = np.concatenate([np.ones(count), np.full(len(bias), _ridge(problem))])
+    k = 0
+    while True:
+        seen = _those(seen, kept)
+        solution = solve(
+            whitened(seen, problem, errors, kept, bias),
+            prior,
+            np.concatenate([start - theta, -bias]),
+            np.concatenate([np.maximum(lower - theta, -0.5), -free]),
+            np.concatenate([np.minimum(upper - theta, 0.5), free]),
+            redescend=k > 0,
+        )
+        theta = theta + solution.change[:count]
+        k += 1
+        if k == config.rounds or (k > 2 and _settled(solution, count)):
+            return _unknowns(problem.unknowns, theta), solution, seen
+        bias = bias + solution.change[count:]
+        seen = sensitivities(problem, _unknowns(problem.unknowns, theta))
+
+
+def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivity:
+    return jax.tree.map(lambda a: a[kept], seen)
+
+
+def _settled(solution: Solution, count: int) -> bool:
+    return bool(np.all(np.abs(solution.change[:count]) < 0.02 * np.maximum(solution.standard_error[:count], 1e-8)))
+
+
+def _ridge(problem: Problem) -> float:
+    """Precision of the output layer's weights: they may change by as much as they are."""
+    if problem.unknowns.potential is None:
+        return 0.0
+    weight = np.asarray(problem.unknowns.potential.network.layers[-1].weight, float)
+    return float(1 / np.mean(weight**2))
+
+
+def _vector(unknowns: Unknowns) -> Float[np.ndarray, " p"]:
+    parts = (unknowns.log_mass_ratio, unknowns.friction, unknowns.restitution)
+    return np.concatenate([np.zeros(0) if part is None else np.asarray(part, float) for part in parts])
+
+
+def _unknowns(like: Unknowns, theta: Float[np.ndarray, " p"]) -> Unknowns:
+    out, first = like, 0
+    for name in ("log_mass_ratio", "friction", "restitution"):
+        part = getattr(like, name)
+        if part is not None:
+            value = jnp.asarray(theta[first : first + len(part)], part.dtype)
+            out, first = eqx.tree_at(lambda u, name=name: getattr(u, name), out, value), first + len(part)
+    return out
+
+
+def _bounds(unknowns: Unknowns) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    ends = {"log_mass_ratio": (-np.inf, np.inf), "friction": (0.0, np.inf), "restitution": (0.0, 1.0)}
+    lower, upper = (
+        np.concatenate([np.full(0 if (p := getattr(unknowns, n)) is None else len(p), e[k]) for n, e in ends.items()])
+        for k in range(2)
+    )
+    return lower, upper
+
+
+def error_sizes(seen: StepSensitivity, recording: Recording) -> Float[np.ndarray, " R"]:
+    """Standard deviation of the error of each recorded number: one for the positions of a point, one for velocities.
+
+    Robust (median), from the steps without a closed contact: their residual has the errors of two states.
+    """
+    n, d = recording.x.shape[2:]
+    smooth = (seen.gap >= 0).all(axis=1) if seen.gap.shape[1] else np.ones(len(seen.gap), bool)
+    residual = seen.residual[smooth if smooth.sum() >= 10 else slice(None)].reshape(-1, 2, n, d)
+    size = 1.4826 * np.median(np.abs(residual), axis=(0, 3)) / np.sqrt(2)
+    speed = np.sqrt(np.mean(recording.v[:, 0] ** 2))
+    floor = 1e-9 * max(speed, 1e-9) * np.array([recording.dt, 1.0])[:, None]
+    return np.repeat(np.maximum(size, floor).reshape(-1), d)
+
+
+def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: float) -> Bool[np.ndarray, " S"]:
+    """Steps in which no gap is so near to zero, before or after, that errors of the data decide what is closed."""
+    margin = doubt * np.linalg.norm(seen.gap_slope * errors[: seen.gap_slope.shape[2]], axis=-1)
+    sure = (seen.gap_before > margin) & (np.abs(seen.gap) > margin)
+    return sure.all(axis=1) & np.isfinite(seen.residual).all(axis=1)
+
+
+def whitened(seen: StepSensitivity, problem: Problem, errors, kept, bias) -> Blocks:
+    """Residuals and Jacobians in units of their standard deviation, by step."""
+    unknowns, P = problem.unknowns, problem.skeleton.n_properties
+    steps, rows = seen.residual.shape
+    columns = [np.asarray(seen.log_mass_ratio)]
+    for name in ("friction", "restitution"):
+        if getattr(unknowns, name) is not None:
+            dense = np.zeros((steps, rows, P + 1))
+            for k in range(seen.column.shape[1]):
+                dense[np.arange(steps), :, seen.column[:, k]] += getattr(seen, name)[:, :, k]
+            columns.append(dense[:, :, :P])
+    jacobian = np.concatenate([*columns, seen.features], axis=2)
+    residual = seen.residual + seen.features @ bias
+    spread = seen.state * errors
+    covariance = spread @ spread.transpose(0, 2, 1) + np.diag(errors**2)
+    # In units of the errors, so that positions and velocities are alike in size.
+    factor = np.linalg.cholesky(covariance / (errors[:, None] * errors))
+    both = np.concatenate([residual[..., None], jacobian], axis=2) / errors[:, None]
+    both = np.linalg.solve(factor, both)
+    kind = np.any(seen.gap < 0, axis=1).astype(int)
+    return Blocks(both[..., 0], both[..., 1:], problem.steps[kept, 0], kind)

@@ -1,0 +1,130 @@
+"""One step's prediction error, its derivatives by everything it depends on, and what its contacts did."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from carom.contact.impulses import Jump
+from carom.learning.models import NeuralPotential, Unknowns
+from carom.simulation.rollout import Stepper, contact_jump, step
+from carom.system import System
+
+
+class StepSensitivity(NamedTuple):
+    """Of one step from a recorded state, with rows for positions (m), then velocities (m/s) of all points.
+
+    `residual`, predicted minus recorded; its derivatives by `log_mass_ratio`, by `friction` and `restitution` of the
+    properties `column` of the closed contacts (P, the number of properties, for unused places), by the `state` before
+    the step, by a `force` held over the step, and by the network's output `features` (none without a network).
+    `gap_before`, `gap`: of every contact at the recorded start and at the predicted end; `gap_slope`, derivative of the
+    former by positions; `property` of each contact in the solver (P for an unused place); `jump`, how far the contacts
+    changed the velocities (m/s, norm over all points); normal and tangential impulses (N s) by phase, see `Jump`.
+    """
+
+    residual: Float[Array, " R"]
+    log_mass_ratio: Float[Array, "R B"]
+    friction: Float[Array, "R K"]
+    restitution: Float[Array, "R K"]
+    state: Float[Array, "R R"]
+    features: Float[Array, "R F"]
+    column: Int[Array, " K"]
+    gap_before: Float[Array, " C"]
+    gap: Float[Array, " C"]
+    gap_slope: Float[Array, "C nd"]
+    property: Int[Array, " K"]
+    jump: Float[Array, ""]
+    normal: Float[Array, "phases K"]
+    tangential: Float[Array, "phases K"]
+
+
+def step_sensitivity(
+    unknowns: Unknowns, skeleton: System, stepper: Stepper, features: Float[Array, "W F"] | None, start, end
+) -> StepSensitivity:
+    """Of the step from the recorded state `start` to `end`, each `(x, v)`.
+
+    The Jacobian has a column for the properties of the closed contacts only, so that its cost does not grow with the
+    number of properties. `features` are directions in the weights of the network's output layer, see `force_features`.
+    """
+    x, v = start
+    system = unknowns.assemble(skeleton)
+    free = dataclasses.replace(stepper, contact=False)
+    before = step(system, x, v, free)
+    if skeleton.contacts:
+        active = system.active(before.x)
+        place = jnp.where(active.active, active.property_index, skeleton.n_properties)
+        # A property of two closed contacts gets one column, else its derivative would be counted twice.
+        twice = jnp.any(jnp.tril(place[:, None] == place[None, :], -1), axis=1)
+        column = jnp.where(twice, skeleton.n_properties, place)
+    else:
+        place = column = jnp.zeros(0, int)
+
+    def predict(nudge):
+        moved = _nudged(unknowns, nudge, column, skeleton)
+        out = step(moved, x + nudge["x"], v + nudge["v"], free, nudge["force"])
+        x1, v1 = out.x, out.v
+        if not skeleton.contacts:
+            return (x1, v1), (x1, v1, Jump(jnp.zeros_like(v1), jnp.zeros((), x.dtype)))
+        _, jump = contact_jump(moved, x1, v1, moved.inverse_mass_matrix(), stepper)
+        return (x1, v1 + jump.velocity), (x1, v1 + jump.velocity, jump)
+
+    zeros = jnp.zeros(column.shape, x.dtype)
+    masses = jnp.zeros(0 if unknowns.log_mass_ratio is None else unknowns.log_mass_ratio.shape, x.dtype)
+    nothing = {"mass": masses, "friction": zeros, "restitution": zeros}
+    nothing |= {name: jnp.zeros_like(x) for name in ("x", "v", "force")}
+    jacobian, (x1, v1, jump) = jax.jacfwd(predict, has_aux=True)(nothing)
+    impulse = jnp.zeros((0, len(column), x.shape[1]), x.dtype) if jump.impulse is None else jump.impulse
+
+    def rows(name):
+        return jnp.concatenate([part[name].reshape(x.size, -1) for part in jacobian])
+
+    return StepSensitivity(
+        residual=jnp.concatenate([(x1 - end[0]).reshape(-1), (v1 - end[1]).reshape(-1)]),
+        log_mass_ratio=rows("mass"),
+        friction=rows("friction"),
+        restitution=rows("restitution"),
+        state=jnp.concatenate([rows("x"), rows("v")], axis=1),
+        features=rows("force") @ force_features(unknowns.potential, x, features),
+        column=column,
+        gap_before=system.gaps(x),
+        gap=system.gaps(before.x),
+        gap_slope=jax.jacfwd(system.gaps)(x).reshape(-1, x.size),
+        property=place,
+        jump=jnp.linalg.norm(jump.velocity),
+        normal=impulse[..., 0],
+        tangential=jnp.linalg.norm(impulse[..., 1:], axis=-1),
+    )
+
+
+def _nudged(unknowns: Unknowns, nudge, column, skeleton: System) -> System:
+    """The system with its masses, and friction and restitution of the properties `column`, changed a little."""
+    if unknowns.log_mass_ratio is not None:
+        unknowns = eqx.tree_at(lambda u: u.log_mass_ratio, unknowns, unknowns.log_mass_ratio + nudge["mass"])
+    system = unknowns.assemble(skeleton)
+    friction, restitution = (
+        getattr(system, name).at[column].add(nudge[name], mode="drop") for name in ("friction", "restitution")
+    )
+    return eqx.tree_at(lambda s: (s.friction, s.restitution), system, (friction, restitution))
+
+
+def force_features(
+    potential: NeuralPotential | None, x: Float[Array, "n d"], directions: Float[Array, "W F"] | None = None
+) -> Float[Array, "nd F"]:
+    """Generalised force (N) of a unit change of the weights of the network's output layer, along `directions`.
+
+    The output layer's part of the potential is linear in its weights, so that these are all the forces it can add.
+    """
+    if potential is None:
+        return jnp.zeros((x.size, 0), x.dtype)
+    weight = potential.network.layers[-1].weight
+
+    def value(x, weight):
+        changed = eqx.tree_at(lambda p: p.network.layers[-1].weight, potential, weight)
+        return changed(x, jnp.zeros((0, 0), x.dtype))
+
+    force = -jax.jacfwd(lambda x: jax.grad(value, argnums=1)(x, weight).reshape(-1))(x).reshape(-1, x.size).T
+    force = force.astype(x.dtype)
+    return force if directions is None else force @ directions
