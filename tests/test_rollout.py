@@ -18,6 +18,7 @@ import carom
         ("bp5-e", {0.98: 1e-8, 0.995: 1e-7}),
         ("cp3", {0.98: 1e-8, 0.995: 1e-7}),
         ("gyro-e", {0.98: 1e-5, 0.995: 1e-4}),
+        ("rope", {0.5: 1e-8, 0.95: 1e-4}),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )

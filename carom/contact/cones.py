@@ -1,4 +1,4 @@
-r"""Friction-cone problems: a batched interior-point solver and its derivative. Arrays only.
+r"""Friction-cone problems: a batched solver and its derivative. Arrays only.
 
 The problem, for each of a batch of `B` independent sets of `K` contacts in `d` = 2 or 3 dimensions (paper, eqs. 5
 and 7, appendix C):
@@ -42,6 +42,9 @@ from carom.contact.interior_point import interior_point
 #
 # Where A is singular the impulse is not unique. A diagonal delta I added to A (before the scaling, so that the norm
 # is that of the impulse itself) selects the solution of least norm as delta -> 0.
+#
+# Two ways lead to the solution: Newton steps onto an active set that Gauss-Seidel shows (`active_set.py`), and where
+# that fails the central path (`interior_point.py`), whose end is such a step too. The matrix is the same.
 #
 # Steps are Mehrotra's predictor-corrector with Nesterov-Todd scaling W (W z = W^-1 s): (Q + W^-2 + D) dy = rhs. The
 # eigenvectors of W^-2 are known: p = (1, u)/sqrt 2, m = (1, -u)/sqrt 2 and, in 3D, the tangent across u. In that frame

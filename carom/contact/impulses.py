@@ -254,7 +254,8 @@ def target_velocity(
     `v* = J_C (I - J_E^T (J_E J_E^T)^-1 J_E) J_C^+ v_d` (S.23 with its misprint mended), `v_d = depth / time` along
     normals.
     The pseudo-inverse of S.24 is taken as the limit of `J_C^T (J_C J_C^T + delta)^-1`, which covers both its cases,
-    redundant contacts, and the zero rows of contacts that are not active. No gradient flows through it.
+    redundant contacts, and the zero rows of contacts that are not active. `J_C J_C^+` is one in the first case (no more
+    contacts than points), as S.24 has it, even where contacts are redundant. No gradient flows through it.
     """
     k, d = contact_jacobian.shape[:2]
     JC = jax.lax.stop_gradient(contact_jacobian).reshape(k * d, -1)
@@ -263,9 +264,11 @@ def target_velocity(
     desired = jnp.zeros((k, d), JC.dtype).at[:, 0].set(depth / time).reshape(-1)
     eps = jnp.finfo(JC.dtype).eps ** 0.6  # 4e-10 in double precision, 7e-5 in single
     v = JC.T @ _solve_regular(JC @ JC.T, desired, eps)
+    closed = jnp.sum(jnp.any(JC.reshape(k, -1) != 0, axis=1))
+    target = jnp.where(closed * d > JC.shape[1], JC @ v, desired)
     if JE.shape[0]:
-        v = v - JE.T @ _solve_regular(JE @ JE.T, JE @ v, 0.0)
-    return (JC @ v).reshape(k, d)
+        target = target - JC @ (JE.T @ _solve_regular(JE @ JE.T, JE @ v, 0.0))
+    return target.reshape(k, d)
 
 
 def _solve_regular(matrix, rhs, relative):
