@@ -18,9 +18,9 @@ from rich.console import Console
 import carom
 from carom.atomic import write_whole
 from carom.cli.main import configure_jax
+from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import Dataset
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
-from carom.learning.train import FORMULATIONS
 from carom.tasks import find_task
 
 MODELS = ("clnn", "mlp-cd-clnn", "in-cp-clnn", "in-cp-sp")

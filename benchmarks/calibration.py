@@ -29,10 +29,10 @@ from rich.table import Table
 
 import carom
 from carom.cli.main import configure_jax
+from carom.learning.config import Quantity
 from carom.learning.dataset import Dataset
 from carom.learning.identify import Identification, identify
 from carom.learning.models import mass_ratios
-from carom.learning.train import Quantity
 
 
 def noisy(recording: carom.Recording, sd: float, seed: int) -> carom.Recording:

@@ -15,6 +15,7 @@ from .contact.impulses import solve_impulse as solve_impulse
 from .contact.limits import BendLimit as BendLimit
 from .contact.limits import StretchLimit as StretchLimit
 from .errors import CaromError as CaromError
+from .learning.config import LearnConfig as LearnConfig
 from .learning.dataset import Dataset as Dataset
 from .learning.dataset import recording_of as recording_of
 from .learning.evaluate import evaluate as evaluate
@@ -24,7 +25,6 @@ from .learning.identify import identify as identify
 from .learning.model_file import save_model as save_model
 from .learning.models import NeuralPotential as NeuralPotential
 from .learning.refine import IdentifyConfig as IdentifyConfig
-from .learning.train import LearnConfig as LearnConfig
 from .learning.train import LearnReport as LearnReport
 from .learning.train import learn as learn
 from .mechanics.bodies import Body as Body

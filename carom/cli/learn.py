@@ -15,12 +15,13 @@ from carom.cli.arguments import ContactModelName, FilePath, FolderPath, TaskName
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.contact.impulses import contact_model_of
 from carom.learning.baselines import BASELINES
+from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
-from carom.learning.train import FORMULATIONS, LearnConfig, LearnReport, learn, quantities
+from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
