@@ -163,7 +163,6 @@ def test_a_baseline_has_only_the_unknowns_it_uses():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_a_baseline_is_learned_evaluated_and_saved(tmp_path):
     truth = ball_on_floor()
     x0 = jnp.array([[[0.1 * k, 0.12 + 0.02 * k]] for k in range(12)])

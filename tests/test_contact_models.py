@@ -248,7 +248,6 @@ def test_derivatives_through_a_step_of_cp3(model, cp3, data):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_a_training_step_with_lcp_has_finite_gradients(cp3, data):
     """The paper's LCP baseline had none (appendix J)."""
     config = dataclasses.replace(TINY, contact_model="lcp")
@@ -271,7 +270,6 @@ def test_a_training_step_with_lcp_has_finite_gradients(cp3, data):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_epsilon_is_learned_reported_and_saved(cp3, data, tmp_path):
     config = dataclasses.replace(TINY, contact_model="cmr", epsilon="learn")
     run = RunFolder.create(tmp_path / "run", {})

@@ -121,7 +121,6 @@ def test_exact_data_give_exact_values():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_intervals_cover_the_truth():
     truth, start = ball(), started_off(ball())
     found = [identify(start, throws(truth, 25, along=4.0, seed=seed), learned=CONTACT) for seed in range(60)]

@@ -110,7 +110,6 @@ def lcp_violation(A, v, friction, rebound, f, target=0.0, facets=4):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 @pytest.mark.parametrize("d", [2, 3])
 def test_every_plastic_impact_is_solved(d):
     """Without restitution a solution always exists, whatever is redundant, jammed, light, heavy, slow or absent.
@@ -319,7 +318,6 @@ def test_forward_equals_reverse(d):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 @pytest.mark.parametrize("d", [2, 3])
 def test_gradients_are_finite_on_all_problems(d):
     A, v, friction, rebound, v_star = battery(d, batch=768, room=4)

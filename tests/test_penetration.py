@@ -68,7 +68,6 @@ def test_bad_compensation_steps_are_refused(steps):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_recordings_and_evaluations_take_compensation_steps():
     """Predictions equal a recording that was made with the same, and differ from others."""
     system = carom.task("cp3")

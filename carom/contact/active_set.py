@@ -95,7 +95,7 @@ def finish(
     def body(state: tuple[Array, Array, Array, Array, Array]):
         regular, error, solution, residual, count = state
         active = ActiveSet.at(proximal, regular)
-        matrix = NewtonMatrix(proximal.Q, active.scaling, active.curvature, active.rhs[:, :, None])
+        matrix = NewtonMatrix(proximal.Q, active.scaling, active.curvature, active.rhs[:, :, None], unrolled=False)
         polished = regular + matrix.solution[:, :, 0]
         new_error = residual_of(proximal, polished)
         improves = new_error <= error

@@ -57,6 +57,8 @@ def as_one_batch(solve: Callable[..., Any], name: str) -> Callable[..., Any]:
     It is what a derivative rule calls, and has no derivative of its own: asking for one says that `name` has none.
     """
 
+    solve = jax.jit(solve)  # traced once for each shape, however often it is met
+
     @jax.custom_batching.custom_vmap
     def batched(*arrays):
         return solve(*arrays)

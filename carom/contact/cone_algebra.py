@@ -153,6 +153,8 @@ class NewtonMatrix:
         scaling: Scaling,
         curvature: Float[Array, "K B"],
         rhs: Float[Array, "K d m B"] | None = None,
+        *,
+        unrolled: bool = True,
     ):
         k, d, batch = scaling.inverse.shape
         rotated = (jnp.max(scaling.inverse, axis=1) ** 2 > curvature)[:, None, None]
@@ -172,9 +174,9 @@ class NewtonMatrix:
         H = H.at[index, :, index].add(block)
         H = H.reshape(k * d, k * d, batch)
         if rhs is None:
-            self.factor = Cholesky(H)
+            self.factor = Cholesky(H, unrolled=unrolled)
         else:
-            self.factor = Cholesky(H, self.rotate(rhs).reshape(k * d, -1, batch))
+            self.factor = Cholesky(H, self.rotate(rhs).reshape(k * d, -1, batch), unrolled=unrolled)
             self.solution = self.restore(self.factor.solution.reshape(rhs.shape))
 
     def rotate(self, x: Float[Array, "K d *m B"]) -> Float[Array, "K d *m B"]:

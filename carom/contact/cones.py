@@ -183,7 +183,7 @@ def _long_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple
     else:
         active = ActiveSet.at(problem, found.regular, scales.apex)
         scaling, bound = active.scaling, active.curvature
-    return found, NewtonMatrix(problem.Q, scaling, bound), bound
+    return found, NewtonMatrix(problem.Q, scaling, bound, unrolled=False), bound
 
 
 def _proximal_point(problem: Problem, scales: Scales, settings: ConeSettings) -> _Solved:

@@ -83,7 +83,7 @@ _FRACTION = 0.95
 def _interior_point_step(problem: Problem, it: Iterate, smoothing, careful: Bool[Array, " B"]) -> Iterate:
     scaling = Scaling.of(it.y, it.z)
     curvature = it.w / it.u
-    matrix = NewtonMatrix(problem.Q, scaling, curvature)
+    matrix = NewtonMatrix(problem.Q, scaling, curvature, unrolled=False)
     gradient = matvec(problem.Q, it.y) + problem.q
 
     def newton(correction, bound_correction):

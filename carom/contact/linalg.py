@@ -21,13 +21,16 @@ class Cholesky:
     """Cholesky factor `H = L L^T` of a batch of SPD matrices `(n, n, B)`, with the batch last.
 
     With `rhs` (n, m, B), `solution` is that of `H x = rhs`: elimination of the right-hand sides along with the matrix
-    costs much less than `solve` does afterwards. A matrix that is not positive definite gives NaN in its own lane and
-    no other.
+    costs much less than `solve` does afterwards. `unrolled`: write the elimination out over the batch, as above, if the
+    matrix is not too large; without it LAPACK is called, which compiles at once. A matrix that is not positive definite
+    gives NaN in its own lane and no other.
     """
 
-    def __init__(self, matrix: Float[Array, "n n B"], rhs: Float[Array, "n m B"] | None = None):
-        self.size = matrix.shape[0]
-        if self.size <= UNROLL_LIMIT:
+    def __init__(
+        self, matrix: Float[Array, "n n B"], rhs: Float[Array, "n m B"] | None = None, *, unrolled: bool = True
+    ):
+        self.size, self.unrolled = matrix.shape[0], unrolled and matrix.shape[0] <= UNROLL_LIMIT
+        if self.unrolled:
             extended = _factor_unrolled(matrix if rhs is None else jnp.concatenate([matrix, rhs.swapaxes(0, 1)]))
             self.columns = [column[: self.size - j] for j, column in enumerate(extended)]
             if rhs is not None:
@@ -41,16 +44,16 @@ class Cholesky:
 
     def triangle(self) -> Float[Array, "B n n"]:
         """`L`, with the batch first."""
-        return jnp.moveaxis(self._rows(), -1, 0) if self.size <= UNROLL_LIMIT else self.lower
+        return jnp.moveaxis(self._rows(), -1, 0) if self.unrolled else self.lower
 
     def _rows(self) -> Float[Array, "n n B"]:
         return jnp.stack([jnp.pad(c, ((j, 0), (0, 0))) for j, c in enumerate(self.columns)], axis=1)
 
     def solve(self, rhs: Float[Array, "n *m B"]) -> Float[Array, "n *m B"]:
         """Solve `H x = rhs` for one or several right-hand sides."""
-        if self.size <= UNROLL_SOLVE_LIMIT:
+        if self.unrolled and self.size <= UNROLL_SOLVE_LIMIT:
             return _solve_unrolled(self.columns, rhs)
-        if self.size <= UNROLL_LIMIT:
+        if self.unrolled:
             return _solve_by_rows(self._rows(), rhs)
         flat = jnp.moveaxis(rhs.reshape(self.size, -1, rhs.shape[-1]), -1, 0)
         x = jax.scipy.linalg.cho_solve((self.lower, True), flat)
