@@ -29,7 +29,7 @@ def training(request):
     drawn = chunks.draw(np.random.default_rng(0), CONFIG.batch_size, CONFIG.contact_share)
     skeleton = system.with_max_active(int(closed_contacts(data.x, system).max()) + 2)
     unknowns = initial_unknowns(skeleton, CONFIG)
-    optimizer = make_optimizer(CONFIG, 1000, unknowns)
+    optimizer = make_optimizer(CONFIG, 1000)
     with jax.numpy_dtype_promotion("standard"):
         state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
     inputs = (skeleton, jnp.asarray(data.x), jnp.asarray(data.v), *(jnp.asarray(part) for part in drawn))

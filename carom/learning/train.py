@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -108,25 +109,36 @@ def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
     return optax.cosine_decay_schedule(config.learning_rate, steps, exponent=2.0)
 
 
-def make_optimizer(config: LearnConfig, steps: int, unknowns: Unknowns) -> optax.GradientTransformation:
-    """AdamW with a decaying rate: weight decay for networks alone, a rate of their own for the properties."""
-    schedule = learning_rate_schedule(config, steps)
-    arrays = eqx.filter(unknowns, eqx.is_inexact_array)
+def make_optimizer(config: LearnConfig, steps: int) -> optax.GradientTransformation:
+    """AdamW with a decaying rate: weight decay for networks alone, a rate of their own for the properties.
 
+    The same object for the same configuration, so that `train_step` is compiled once for all trainings like it.
+    """
+    return _optimizer(dataclasses.replace(config, seed=0), steps)
+
+
+@functools.cache
+def _optimizer(config: LearnConfig, steps: int) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.adamw(learning_rate_schedule(config, steps), weight_decay=config.weight_decay, mask=_is_network),
+        optax.masked(optax.scale(config.property_learning_rate / config.learning_rate), _is_property),
+    )
+
+
+def _is_network(unknowns: Unknowns):
     def networks(u):
         return u.potential, u.contact_model, u.step_model
 
-    is_network = eqx.tree_at(
+    return eqx.tree_at(
         networks,
-        jax.tree.map(lambda _: False, arrays),
-        jax.tree.map(lambda _: True, networks(arrays)),
+        jax.tree.map(lambda _: False, unknowns),
+        jax.tree.map(lambda _: True, networks(unknowns)),
         is_leaf=lambda x: x is None,
     )
-    is_property = jax.tree.map(lambda flag: not flag, is_network)
-    return optax.chain(
-        optax.adamw(schedule, weight_decay=config.weight_decay, mask=is_network),
-        optax.masked(optax.scale(config.property_learning_rate / config.learning_rate), is_property),
-    )
+
+
+def _is_property(unknowns: Unknowns):
+    return jax.tree.map(lambda flag: not flag, _is_network(unknowns))
 
 
 LOSS_WIDTH_DECAY = 1e-4
@@ -211,7 +223,7 @@ def validate(unknowns, skeleton, x, v, stepper):
 def fresh_state(skeleton: System, config: LearnConfig, steps: int) -> tuple[TrainState, optax.GradientTransformation]:
     """The state before the first epoch, and the optimiser."""
     unknowns = initial_unknowns(skeleton, config)
-    optimizer = make_optimizer(config, steps, unknowns)
+    optimizer = make_optimizer(config, steps)
     with jax.numpy_dtype_promotion("standard"):
         opt_state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
     zero = jnp.asarray(0)
