@@ -56,7 +56,7 @@ class Learn:
     data_contact_model: ContactModelName = "cm"
     """Contact model of the simulated data; `--contact-model` is the one to learn with."""
     quick: bool = False
-    """A small training of well under a minute, to try things out: few trajectories and epochs."""
+    """A small training of one minute or so after compilation, to try things out: few trajectories and epochs."""
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
 
     def after_interrupt(self) -> str:
