@@ -131,13 +131,11 @@ def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
     """An impulse near the solution, by projected Gauss-Seidel in the metric of `(f_n, f_t)`."""
     k, d, batch = problem.q.shape
     index = jnp.arange(k)
-    Q = problem.Q.reshape(k, d, k, d, batch)
+    rows = problem.Q.reshape(k, d, k * d, batch)
     metric = jnp.concatenate([jnp.ones_like(mu)[:, None], jnp.broadcast_to(mu[:, None], (k, d - 1, batch))], axis=1)
     metric = jnp.where(metric > 0, metric, 1)
-    own = jnp.abs(Q[index, :, index]) / (metric[:, :, None] * metric[:, None])
+    own = jnp.abs(problem.Q.reshape(k, d, k, d, batch)[index, :, index]) / (metric[:, :, None] * metric[:, None])
     stiffness = metric**2 * jnp.max(jnp.sum(own, axis=2), axis=1)[:, None] / _OVERRELAXATION
-
-    rows = problem.Q.reshape(k, d, k * d, batch)
 
     def contact(i: int | Array, y: Array) -> Array:
         gradient = jnp.sum(rows[i] * y.reshape(1, k * d, batch), axis=1) + problem.q[i]

@@ -20,9 +20,10 @@ def contacts_used(A: Array, contacts: int) -> Int[Array, " B"]:
     return jnp.max(jnp.where(~(normal <= 0), jnp.arange(contacts) + 1, 0), axis=1)
 
 
-def sizes(contacts: int) -> tuple[int, ...]:
-    """Numbers of contacts for which problems with room for `contacts` are compiled."""
-    return (SMALL, contacts) if contacts > 2 * SMALL else (contacts,)
+def by_size(used: Int[Array, " B"], contacts: int) -> list[tuple[int, Bool[Array, " B"]]]:
+    """The forms in which problems with room for `contacts` are compiled: a number of contacts, and whose form it is."""
+    sizes = (SMALL, contacts) if contacts > 2 * SMALL else (contacts,)
+    return [(size, (used > smaller) & (used <= size)) for smaller, size in zip((0, *sizes[:-1]), sizes, strict=True)]
 
 
 def solve_chosen(

@@ -230,7 +230,7 @@ _GROSS = 1e-3
 
 
 class Scales(NamedTuple):
-    """What turns scaled quantities into physical ones; see `_scale`."""
+    """What turns scaled quantities into physical ones; see `scale`."""
 
     S: Float[Array, "K d B"]  # y_scaled * S * unit = f
     mu: Float[Array, "K B"]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from carom.contact.active_set import ActiveSet, finish, newton_steps, sweep
-from carom.contact.batching import as_one_batch, contacts_used, sizes, solve_chosen
+from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
 from carom.contact.cone_algebra import (
     ConeSettings,
     Iterate,
@@ -252,15 +252,13 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
     out = (solution, _Sensitivity.nothing(batch, k, d, v.dtype) if sensitivity else None)
     # Rounding leaves too little of single precision to tell a solution of the short way from others.
     ways = (True, False) if settings.smoothing == 0 and v.dtype == jnp.float64 else (False,)
-    at_least = 0
-    for size in sizes(k):
+    for size, chosen in by_size(used, k):
         m = size * d
         arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
         for short in ways:
-            missing = (used > at_least) & (used <= size) & ~(out[0].residual <= _wanted(settings))
+            missing = chosen & ~(out[0].residual <= _wanted(settings))
             solve = functools.partial(_solve_block, settings=settings, sensitivity=sensitivity, short=short)
             out = solve_chosen(solve, arrays, missing, _block_size(m), out)
-        at_least = size
     return out
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from carom.contact.batching import as_one_batch, contacts_used, sizes, solve_chosen
+from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
 from carom.contact.lemke import lemke
 from carom.contact.linalg import Cholesky
 from carom.errors import CaromError
@@ -345,15 +345,11 @@ def _solve_batch(A, v, friction, *, facets: int, sensitivity: bool):
     directions = pyramid_directions(d, facets)
     extra = _Sensitivity(jnp.zeros((batch, n, n), v.dtype), jnp.zeros((batch, k, d - 1), v.dtype))
     out = (LCPSolution(jnp.zeros_like(v), jnp.zeros(batch, v.dtype)), extra if sensitivity else None)
-    used = contacts_used(A, k)
-    at_least = 0
-    for size in sizes(k):
+    for size, chosen in by_size(contacts_used(A, k), k):
         arrays = A[:, : size * d, : size * d], v[:, :size], friction[:, :size]
-        chosen = (used > at_least) & (used <= size)
         block = min(max(TABLEAU // (size * (len(directions) + 2)) ** 2, 8), 128)
         solve = functools.partial(_solve_block, directions=directions, sensitivity=sensitivity)
         out = solve_chosen(solve, arrays, chosen, block, out)
-        at_least = size
     return out
 
 
