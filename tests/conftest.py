@@ -75,3 +75,19 @@ def reference_dir() -> Path:
     if named:
         pytest.fail(f"CAROM_REFERENCE_DATA is {named!r}, which is not a folder", pytrace=False)
     pytest.skip("no reference data; set CAROM_REFERENCE_DATA to its folder")
+
+
+@pytest.fixture(scope="session")
+def cp3():
+    """The task `cp3`."""
+    import carom
+
+    return carom.task("cp3")
+
+
+@pytest.fixture(scope="session")
+def cp3_data(cp3):
+    """24 trajectories of `cp3`, a quarter of them to validate on."""
+    import carom
+
+    return carom.Dataset.split(carom.make_recording(cp3, jax.random.key(0), 24), val=0.25)

@@ -13,7 +13,7 @@ from systems import ball_on_floor, refused
 import carom
 from carom.contact.candidates import Active
 from carom.contact.impulses import CONTACT_MODELS
-from carom.learning.dataset import Chunks, Dataset, contact_flags
+from carom.learning.dataset import Chunks, contact_flags
 from carom.learning.model_file import read_model_header
 from carom.learning.run import RunFolder
 from carom.learning.train import fresh_state, learn, train_step
@@ -59,16 +59,6 @@ def problems(family, d, *, batch=16, contacts=3):
     out = generate(np.random.default_rng(21), family, batch, contacts, d)
     scale = np.maximum(np.einsum("bkk->bk", out.A).max(axis=1), 1e-30)[:, None]
     return out._replace(A=out.A / scale[..., None], lower=out.lower * scale)
-
-
-@pytest.fixture(scope="module")
-def cp3():
-    return carom.task("cp3")
-
-
-@pytest.fixture(scope="module")
-def data(cp3):
-    return Dataset.split(carom.make_recording(cp3, jax.random.key(0), 24), val=0.25)
 
 
 # --- CMr ----------------------------------------------------------------------------------------------------------
@@ -198,19 +188,19 @@ def test_restitution_can_leave_zero_with_lcp():
 # --- Derivatives through a step ------------------------------------------------------------------------------------
 
 
-def before_contact(data):
+def before_contact(dataset):
     """Recorded states from which a step ends in a contact."""
-    trajectory, time = np.nonzero(data.train.contact)
-    return jnp.asarray(data.train.x[trajectory, time - 1]), jnp.asarray(data.train.v[trajectory, time - 1])
+    trajectory, time = np.nonzero(dataset.train.contact)
+    return jnp.asarray(dataset.train.x[trajectory, time - 1]), jnp.asarray(dataset.train.v[trajectory, time - 1])
 
 
 @pytest.mark.slow
 @pytest.mark.ci_budget
 @pytest.mark.parametrize("model", ["lcp", "cmr"])
-def test_derivatives_through_a_step_of_cp3(model, cp3, data):
+def test_derivatives_through_a_step_of_cp3(model, cp3, cp3_data):
     """By all that states and systems consist of, against differences, for many impacts at once."""
     system = eqx.tree_at(lambda s: s.restitution, cp3.with_contact_model(model), jnp.array([0.4]))
-    x0, v0 = (a[:64] for a in before_contact(data))
+    x0, v0 = (a[:64] for a in before_contact(cp3_data))
     arrays, rest = eqx.partition(system, eqx.is_inexact_array)
     rng = np.random.default_rng(4)
     point = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(x0), *a.shape)), arrays), x0, v0
@@ -248,10 +238,10 @@ def test_derivatives_through_a_step_of_cp3(model, cp3, data):
 
 
 @pytest.mark.slow
-def test_a_training_step_with_lcp_has_finite_gradients(cp3, data):
+def test_a_training_step_with_lcp_has_finite_gradients(cp3, cp3_data):
     """The paper's LCP baseline had none (appendix J)."""
     config = dataclasses.replace(TINY, contact_model="lcp")
-    skeleton, train = config.prepare(cp3), data.train
+    skeleton, train = config.prepare(cp3), cp3_data.train
     assert isinstance(skeleton.contact_model, carom.LCP)
     chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.chunk_length)
     drawn = chunks.draw(np.random.default_rng(0), config.batch_size, 1.0)
@@ -270,10 +260,10 @@ def test_a_training_step_with_lcp_has_finite_gradients(cp3, data):
 
 
 @pytest.mark.slow
-def test_epsilon_is_learned_reported_and_saved(cp3, data, tmp_path):
+def test_epsilon_is_learned_reported_and_saved(cp3, cp3_data, tmp_path):
     config = dataclasses.replace(TINY, contact_model="cmr", epsilon="learn")
     run = RunFolder.create(tmp_path / "run", {})
-    system, report = learn(cp3, data, config, run=run, progress=False)
+    system, report = learn(cp3, cp3_data, config, run=run, progress=False)
     run.close()
     assert report.skipped_steps == 0
     assert report.epsilon == float(system.contact_model.epsilon)
@@ -329,9 +319,9 @@ class Sticky(carom.ContactModel):
         return carom.Jump(jnp.where(stops, -self.share * state.v, 0), jnp.zeros(()))
 
 
-def test_a_contact_model_of_ones_own(tmp_path, cp3, data):
+def test_a_contact_model_of_ones_own(tmp_path, cp3, cp3_data):
     system = cp3.with_contact_model(Sticky(jnp.asarray(0.5)))
-    x0, v0 = (a[:1] for a in before_contact(data))
+    x0, v0 = (a[:1] for a in before_contact(cp3_data))
     free = simulate(cp3, x0, v0, dt=0.01, steps=1, contact_model=Sticky(jnp.asarray(0.0)))
     out = simulate(system, x0, v0, dt=0.01, steps=1)
     np.testing.assert_allclose(out.v[:, 1], free.v[:, 1] / 2, rtol=1e-12)
@@ -340,7 +330,7 @@ def test_a_contact_model_of_ones_own(tmp_path, cp3, data):
     assert float(again.contact_model.share) == 0.5
 
 
-def test_bad_contact_models_are_refused_by_name(cp3, data):
+def test_bad_contact_models_are_refused_by_name(cp3, cp3_data):
     message = "contact_model must be one of 'cm', 'cmr', 'lcp', or a ContactModel; it was "
     x0, v0 = jnp.zeros((1, 2)), jnp.zeros((1, 2))
     with refused(message + "'cmx'"):
@@ -352,19 +342,19 @@ def test_bad_contact_models_are_refused_by_name(cp3, data):
     with refused(message + "'CM'"):
         carom.make_recording(cp3, jax.random.key(0), 2, contact_model="CM")
     with refused(message + "'soft'"):
-        learn(cp3, data, dataclasses.replace(TINY, contact_model="soft"))
+        learn(cp3, cp3_data, dataclasses.replace(TINY, contact_model="soft"))
     with refused("epsilon must be a finite number of at least 0; it was -0.1"):
         carom.CMr(-0.1)
     with refused("epsilon must be one number; its shape was (2,)"):
         carom.CMr([0.1, 0.2])
     with refused("epsilon must be a finite number of at least 0; it was nan"):
-        learn(cp3, data, dataclasses.replace(TINY, contact_model="cmr", epsilon=float("nan")))
+        learn(cp3, cp3_data, dataclasses.replace(TINY, contact_model="cmr", epsilon=float("nan")))
     with refused("epsilon belongs to the contact model cmr; the contact model was CM"):
-        learn(cp3, data, dataclasses.replace(TINY, epsilon=0.1))
+        learn(cp3, cp3_data, dataclasses.replace(TINY, epsilon=0.1))
     with refused("epsilon must be"):
-        learn(cp3, data, dataclasses.replace(TINY, contact_model="cmr", epsilon="fit"))
+        learn(cp3, cp3_data, dataclasses.replace(TINY, contact_model="cmr", epsilon="fit"))
     with refused('epsilon "learn" starts from'):
-        learn(cp3.with_contact_model(carom.CMr(0.0)), data, dataclasses.replace(TINY, epsilon="learn"))
+        learn(cp3.with_contact_model(carom.CMr(0.0)), cp3_data, dataclasses.replace(TINY, epsilon="learn"))
     with refused("facets must be even and at least 4; it was 5"):
         carom.LCP(5)
     with refused("smoothing must be 0 with the contact model LCP"):

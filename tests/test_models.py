@@ -11,11 +11,6 @@ from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 
 
 @pytest.fixture(scope="module")
-def cp3():
-    return carom.task("cp3")
-
-
-@pytest.fixture(scope="module")
 def unknowns():
     potential = NeuralPotential(3, 2, width=8, depth=2, key=jax.random.key(0))
     return Unknowns(jnp.log(jnp.array([3.0, 0.5])), jnp.array([0.7]), jnp.array([0.2]), potential)

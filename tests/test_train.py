@@ -20,24 +20,14 @@ TINY = carom.LearnConfig(
 )
 
 
-@pytest.fixture(scope="module")
-def cp3():
-    return carom.task("cp3")
-
-
-@pytest.fixture(scope="module")
-def data(cp3):
-    return Dataset.split(carom.make_recording(cp3, jax.random.key(0), 24), val=0.25)
-
-
 def numbers(system):
     return np.concatenate([system.friction, system.restitution, mass_ratios(system)])
 
 
-def test_learning_lowers_the_loss_and_reports_it(cp3, data, tmp_path):
+def test_learning_lowers_the_loss_and_reports_it(cp3, cp3_data, tmp_path):
     run = RunFolder.create(tmp_path / "run", {})
     config = dataclasses.replace(TINY, epochs=8, learning_rate=1e-2)
-    system, report = learn(cp3, data, config, run=run, progress=False)
+    system, report = learn(cp3, cp3_data, config, run=run, progress=False)
     run.close()
     metrics = run.metrics()
     assert [m["epoch"] for m in metrics] == list(range(1, 9))
@@ -49,9 +39,9 @@ def test_learning_lowers_the_loss_and_reports_it(cp3, data, tmp_path):
     assert not np.allclose(numbers(system), numbers(cp3), atol=1e-2)
 
 
-def test_a_resumed_training_equals_an_uninterrupted_one(cp3, data, tmp_path):
+def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path):
     whole = RunFolder.create(tmp_path / "whole", {})
-    expected, _ = learn(cp3, data, TINY, run=whole, progress=False)
+    expected, _ = learn(cp3, cp3_data, TINY, run=whole, progress=False)
     whole.close()
 
     class KilledError(Exception):
@@ -65,11 +55,11 @@ def test_a_resumed_training_equals_an_uninterrupted_one(cp3, data, tmp_path):
 
     dying = Dying.create(tmp_path / "killed", {})
     with pytest.raises(KilledError):
-        learn(cp3, data, TINY, run=dying, progress=False)
+        learn(cp3, cp3_data, TINY, run=dying, progress=False)
     dying.close()
     again = RunFolder.open(tmp_path / "killed")
     assert again.metrics()[-1]["epoch"] == 3  # logged, but its checkpoint was not written
-    system, report = learn(cp3, data, TINY, run=again, progress=False)
+    system, report = learn(cp3, cp3_data, TINY, run=again, progress=False)
     again.close()
     assert report.epochs == 4
     assert [m["epoch"] for m in again.metrics()] == [1, 2, 3, 4]
@@ -77,27 +67,27 @@ def test_a_resumed_training_equals_an_uninterrupted_one(cp3, data, tmp_path):
     assert [m["val_loss"] for m in again.metrics()] == [m["val_loss"] for m in whole.metrics()]
 
 
-def test_early_stopping_keeps_the_best(cp3, data):
+def test_early_stopping_keeps_the_best(cp3, cp3_data):
     config = dataclasses.replace(TINY, epochs=40, patience=2, learning_rate=0.5)
-    _, report = learn(cp3, data, config, progress=False)
+    _, report = learn(cp3, cp3_data, config, progress=False)
     assert report.stopped_early
     assert report.epochs < 40
 
 
-def test_only_what_is_asked_for_is_learned(cp3, data):
+def test_only_what_is_asked_for_is_learned(cp3, cp3_data):
     config = dataclasses.replace(TINY, learn=("friction", "restitution"), epochs=2)
-    system, _ = learn(cp3, data, config, progress=False)
+    system, _ = learn(cp3, cp3_data, config, progress=False)
     assert isinstance(system.potential, carom.Gravity)
     assert np.array_equal(system.masses, cp3.masses)
     assert system.friction.tolist() != [config.initial_friction]
 
 
-def test_steps_without_a_finite_gradient_are_left_out_and_reported(cp3, data):
+def test_steps_without_a_finite_gradient_are_left_out_and_reported(cp3, cp3_data):
     potential = NeuralPotential(3, 2, width=16, depth=1, key=jax.random.key(0))
     broken = jax.tree.map(lambda a: a * jnp.nan if eqx.is_array(a) else a, potential)
     skeleton = eqx.tree_at(lambda s: s.potential, cp3, broken)
     with refused("the training loss is not finite (6 steps left out)"):
-        learn(skeleton, data, TINY, progress=False)
+        learn(skeleton, cp3_data, TINY, progress=False)
 
 
 def test_initial_values_are_those_of_the_configuration(cp3):
@@ -128,16 +118,16 @@ def test_a_bad_configuration_is_refused(change, message):
         carom.LearnConfig(**change).check()
 
 
-def test_data_that_do_not_fit_the_system_are_refused(cp3, data):
+def test_data_that_do_not_fit_the_system_are_refused(cp3, cp3_data):
     def changed(x):
-        return Dataset(carom.Recording.of(x, data.train.v, dt=0.01), data.val)
+        return Dataset(carom.Recording.of(x, cp3_data.train.v, dt=0.01), cp3_data.val)
 
     with refused("3 points in 2D"):
-        learn(carom.task("bp5"), data, TINY, progress=False)
+        learn(carom.task("bp5"), cp3_data, TINY, progress=False)
     with refused("do not fit the system's rods"):
-        learn(cp3, changed(data.train.x * 2), TINY, progress=False)
+        learn(cp3, changed(cp3_data.train.x * 2), TINY, progress=False)
     with refused("chunk_length is 200"):
-        learn(cp3, data, dataclasses.replace(TINY, chunk_length=200), progress=False)
+        learn(cp3, cp3_data, dataclasses.replace(TINY, chunk_length=200), progress=False)
     bp5 = carom.task("bp5-e")
     inside = carom.make_recording(bp5, jax.random.key(0), 4)
     moved = carom.Recording.of(inside.x - 0.5, inside.v, dt=inside.dt)
