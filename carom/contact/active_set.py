@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from carom.contact.cone_algebra import (
     TINY,
+    Factored,
     NewtonMatrix,
     Problem,
     Scaling,
@@ -122,7 +123,7 @@ def finish(
 _SWEEPS = 30
 # Of the step that a bound of the contact's largest eigenvalue allows: the bound is a loose one.
 _OVERRELAXATION = 1.6
-_NEWTON_STEPS = 3
+_NEWTON_STEPS = 4
 # Most contacts whose updates are written out; more are a loop, which compiles at once.
 _UNROLLED = 8
 
@@ -154,11 +155,28 @@ def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
     return jax.lax.fori_loop(0, _SWEEPS, body, jnp.zeros_like(problem.q))
 
 
-def newton_steps(problem: Problem, y: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
-    """`y` after some Newton steps, each onto the active set seen at its start."""
+class NewtonStep(NamedTuple):
+    """Where the last of `newton_steps` has led."""
 
-    def body(_, y: Array) -> Array:
-        active = ActiveSet.at(problem, y)
-        return y + NewtonMatrix(problem.Q, active.scaling, active.curvature, active.rhs[:, :, None]).solution[:, :, 0]
+    regular: Float[Array, "K d B"]  # the solution, if the active set was the right one
+    y: Float[Array, "K d B"]  # the same without the diagonal
+    margin: Float[Array, " B"]  # how far the nearest contact is from changing sides
+    matrix: Factored
 
-    return jax.lax.fori_loop(0, _NEWTON_STEPS, body, y)
+
+def newton_steps(
+    problem: Problem, y: Float[Array, "K d B"], regularization: Float[Array, "K d B"], apex: Bool[Array, "K B"]
+) -> NewtonStep:
+    """Some Newton steps from `y`, each onto the active set seen at its start. For `apex` see `ActiveSet.at`."""
+
+    def body(count, last: NewtonStep) -> NewtonStep:
+        y = last.regular
+        active = ActiveSet.at(problem, y, apex & (count == _NEWTON_STEPS - 1))
+        sides = jnp.stack([active.rhs, regularization * y], axis=2)
+        matrix = NewtonMatrix(problem.Q, active.scaling, active.curvature, sides)
+        regular = y + matrix.solution[:, :, 0]
+        return NewtonStep(regular, regular + matrix.solution[:, :, 1], active.margin, matrix.factored())
+
+    k, d, batch = y.shape
+    start = NewtonStep(y, y, y[0, 0], Factored.nothing(k, d, batch, y.dtype))
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, body, start)

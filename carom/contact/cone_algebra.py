@@ -140,6 +140,20 @@ def add_normal(x, normal):
 _TURN = np.array([[0.5**0.5, 0.5**0.5, 0.0], [0.5**0.5, -(0.5**0.5), 0.0], [0.0, 0.0, 1.0]])
 
 
+class Factored(NamedTuple):
+    """A factored `NewtonMatrix`, as it is kept for the derivative: its inverse is `frame L^-T L^-1 frame^T`."""
+
+    triangle: Float[Array, "B n n"]  # L
+    frame: Float[Array, "K d d B"]
+    curvature: Float[Array, "K B"]  # D, of the bounds
+
+    @classmethod
+    def nothing(cls, k: int, d: int, batch: int, dtype) -> "Factored":
+        n = k * d
+        zeros = jnp.zeros((k, d, d, batch), dtype)
+        return cls(jnp.zeros((batch, n, n), dtype), zeros, zeros[:, 0, 0])
+
+
 class NewtonMatrix:
     """`Q + W^-2 + D e_n e_n^T`, factored, each contact in the frame in which its own block loses nothing to rounding.
 
@@ -161,6 +175,7 @@ class NewtonMatrix:
         turn = _TURN[:d, :d, None].astype(Q.dtype)
         eye = jnp.eye(d, dtype=Q.dtype)[..., None]
         plain = scaling.along_tangent()
+        self.curvature = curvature
         self.frame = jnp.where(rotated, jnp.sum(plain[:, :, :, None] * turn, axis=2), plain)
         H = self.rotate(Q.reshape(k, d, k * d, batch)).reshape(k * d, k * d, batch).swapaxes(0, 1)
         H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
@@ -178,6 +193,9 @@ class NewtonMatrix:
         else:
             self.factor = Cholesky(H, self.rotate(rhs).reshape(k * d, -1, batch), unrolled=unrolled)
             self.solution = self.restore(self.factor.solution.reshape(rhs.shape))
+
+    def factored(self) -> Factored:
+        return Factored(self.factor.triangle(), self.frame, self.curvature)
 
     def rotate(self, x: Float[Array, "K d *m B"]) -> Float[Array, "K d *m B"]:
         """Components along the frame's axes."""

@@ -20,6 +20,7 @@ from carom.contact.active_set import ActiveSet, finish, newton_steps, sweep
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
 from carom.contact.cone_algebra import (
     ConeSettings,
+    Factored,
     Iterate,
     NewtonMatrix,
     Problem,
@@ -107,7 +108,7 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
     v_last, reference = jnp.moveaxis(v, 0, -1), jnp.moveaxis(reference, 0, -1)
     problem, scales = scale(A_last, v_last, friction.T, lower.T, reference, settings.diagonal)
     way = _short_way if short else _long_way
-    out, matrix, bound = way(problem, scales, settings)
+    out, matrix = way(problem, scales, settings)
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
     solution = _Internal(
         impulse=jnp.moveaxis(scales.S * scales.unit * out.y + nan, -1, 0),
@@ -120,9 +121,9 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
     return solution, _Sensitivity(
         regular=jnp.moveaxis(size * scales.unit * out.regular, -1, 0),
         moved=jnp.moveaxis(size * scales.unit * (out.regular - out.center), -1, 0),
-        triangle=matrix.factor.triangle(),
+        triangle=matrix.triangle,
         frame=jnp.moveaxis(size[:, None] * matrix.frame, -1, 0),
-        bound=(bound / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
+        bound=(matrix.curvature / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
         diagonal=scales.diagonal,
     )
 
@@ -136,19 +137,15 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
 _CLEAR = 1e3  # times the diagonal
 
 
-def _short_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, NewtonMatrix, Array]:
-    y = newton_steps(problem, sweep(problem, scales.mu))
-    active = ActiveSet.at(problem, y, scales.apex)
-    sides = jnp.stack([active.rhs, scales.regularization * y], axis=2)
-    matrix = NewtonMatrix(problem.Q, active.scaling, active.curvature, sides)
-    regular = y + matrix.solution[:, :, 0]
-    solution = regular + matrix.solution[:, :, 1]
-    unique = (active.margin > _CLEAR * settings.diagonal) | (residual_of(problem, regular) < settings.diagonal / _CLEAR)
-    residual = residual_of(problem, solution, scales.regularization)
+def _short_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, Factored]:
+    last = newton_steps(problem, sweep(problem, scales.mu), scales.regularization, scales.apex)
+    unique = (last.margin > _CLEAR * settings.diagonal) | (
+        residual_of(problem, last.regular) < settings.diagonal / _CLEAR
+    )
+    residual = residual_of(problem, last.y, scales.regularization)
     residual = jnp.where(unique & (residual <= _wanted(settings)), residual, jnp.inf)
     zero = jnp.asarray(0)
-    found = _Solved(_start(problem), regular, jnp.zeros_like(y), solution, residual, zero, zero)
-    return found, matrix, active.curvature
+    return _Solved(_start(problem), last.regular, jnp.zeros_like(last.y), last.y, residual, zero, zero), last.matrix
 
 
 def _wanted(settings: ConeSettings) -> float:
@@ -176,14 +173,14 @@ def _start(problem: Problem) -> Iterate:
     return Iterate(y, y[:, 0] - problem.lower, identity, one)
 
 
-def _long_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, NewtonMatrix, Array]:
+def _long_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, Factored]:
     found = _proximal_point(problem, scales, settings)
     if settings.smoothing > 0:
         scaling, bound = Scaling.of(found.it.y, found.it.z), found.it.w / found.it.u
     else:
         active = ActiveSet.at(problem, found.regular, scales.apex)
         scaling, bound = active.scaling, active.curvature
-    return found, NewtonMatrix(problem.Q, scaling, bound, unrolled=False), bound
+    return found, NewtonMatrix(problem.Q, scaling, bound, unrolled=False).factored()
 
 
 def _proximal_point(problem: Problem, scales: Scales, settings: ConeSettings) -> _Solved:
@@ -240,7 +237,7 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
     """Solve a batch block by block. Problems without a contact cost nothing and give zeros.
 
     In a batch with room for many contacts most problems have one or two: these, where they come first in their
-    problem, are solved without the room that they do not use.
+    problem, are solved without the room that they do not use. The long way, where it is that of few, is compiled once.
     """
     batch, k, d = v.shape
     used = contacts_used(A, k)
@@ -251,14 +248,16 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
     )
     out = (solution, _Sensitivity.nothing(batch, k, d, v.dtype) if sensitivity else None)
     # Rounding leaves too little of single precision to tell a solution of the short way from others.
-    ways = (True, False) if settings.smoothing == 0 and v.dtype == jnp.float64 else (False,)
-    for size, chosen in by_size(used, k):
+    has_short_way = settings.smoothing == 0 and v.dtype == jnp.float64
+    forms = [(has_short_way, *form) for form in by_size(used, k)]
+    if has_short_way:
+        forms.append((False, k, used > 0))
+    for short, size, chosen in forms:
         m = size * d
         arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
-        for short in ways:
-            missing = chosen & ~(out[0].residual <= _wanted(settings))
-            solve = functools.partial(_solve_block, settings=settings, sensitivity=sensitivity, short=short)
-            out = solve_chosen(solve, arrays, missing, _block_size(m), out)
+        missing = chosen & ~(out[0].residual <= _wanted(settings))
+        solve = functools.partial(_solve_block, settings=settings, sensitivity=sensitivity, short=short)
+        out = solve_chosen(solve, arrays, missing, _block_size(m), out)
     return out
 
 
