@@ -6,7 +6,6 @@ from the tasks' own data; forward, gradient and update; after warm-up.
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 
 import carom
 from carom.learning.dataset import Chunks, closed_contacts
-from carom.learning.train import gather_chunks, initial_unknowns, make_optimizer, train_step
+from carom.learning.train import Rates, fresh_state, gather_chunks, train_step
 from carom.simulation.rollout import Stepper
 
 CONFIG = carom.LearnConfig()
@@ -28,23 +27,20 @@ def training(request):
     chunks = Chunks.of(data.contact, data.length, CONFIG.states)
     drawn = chunks.draw(np.random.default_rng(0), CONFIG.batch_size, CONFIG.contact_share)
     skeleton = system.with_max_active(int(closed_contacts(data.x, system).max()) + 2)
-    unknowns = initial_unknowns(skeleton, CONFIG)
-    optimizer = make_optimizer(CONFIG, 1000)
-    with jax.numpy_dtype_promotion("standard"):
-        state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
+    state = fresh_state(skeleton, CONFIG)
     inputs = (skeleton, jnp.asarray(data.x), jnp.asarray(data.v), *(jnp.asarray(part) for part in drawn))
     with_contact = float(np.mean(np.any(gather_chunks(data.contact, data.contact, *drawn, CONFIG.states)[0], 1)))
-    return request.param, inputs, unknowns, state, optimizer, with_contact
+    return request.param, inputs, state.unknowns, state.optimizer, with_contact
 
 
 @pytest.mark.parametrize("contact", [False, True], ids=["contact off", "contact on"])
 def test_training_step(benchmark, training, contact):
-    name, inputs, unknowns, state, optimizer, share = training
+    name, inputs, unknowns, state, share = training
     stepper = Stepper(dt=jnp.asarray(0.01), project=False, contact=contact)
-    width = jnp.asarray(0.1)
+    width, rates = jnp.asarray(0.1), Rates.of(CONFIG, CONFIG.learning_rate)
 
     def run():
-        return jax.block_until_ready(train_step(inputs, unknowns, state, optimizer, stepper, CONFIG.states, width)[2])
+        return jax.block_until_ready(train_step(inputs, unknowns, state, rates, stepper, CONFIG.states, width)[2])
 
     run()
     benchmark.group = f"training step, {name}, {share:.0%} of the chunks with a contact"

@@ -9,6 +9,25 @@ from pathlib import Path
 from carom.errors import CaromError
 
 
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Raise at once what writing the file `path` would raise at the end of long work.
+
+    **Raises:** `CaromError` if its folder is missing or not writable.
+    """
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise _cannot_write(target, "there is no such folder")
+    if target.is_dir() or not os.access(target.parent, os.W_OK | os.X_OK):
+        raise _cannot_write(target, "a folder has that name" if target.is_dir() else "permission denied")
+
+
+def _cannot_write(target: Path, why: object) -> CaromError:
+    return CaromError(
+        f"the file {target.name} cannot be written in {target.parent} ({why}); choose a folder that exists, has room "
+        "and can be written to."
+    )
+
+
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file next to `path`, which takes its place when the block ends without an error.
@@ -25,10 +44,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, target)
     except OSError as error:
-        raise CaromError(
-            f"the file {target.name} cannot be written in {target.parent} ({error.strerror or error}); choose a folder "
-            "that exists, has room and can be written to."
-        ) from error
+        raise _cannot_write(target, error.strerror or error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -60,7 +60,7 @@ def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learned")
     environment = {**os.environ, "CAROM_CACHE": ""}
     os.environ.update(environment)
-    command("learn", "cp3", "--out", folder / "run", *TINY)
+    command("learn", "throw", "--out", folder / "run", *TINY)
     return folder / "run"
 
 
@@ -82,7 +82,7 @@ def test_learn_writes_a_whole_run_folder(learned):
         "prediction.gif",
     }
     config = json.loads((learned / "config.json").read_text())
-    assert (config["task"], config["epochs"], config["model"]) == ("cp3", 2, "clnn")
+    assert (config["task"], config["epochs"], config["model"]) == ("throw", 2, "clnn")
     assert [m["epoch"] for m in RunFolder.open(learned).metrics()] == [1, 2]
     report = json.loads((learned / "report.json").read_text())
     assert set(report) == {"learned", "evaluation", "identification"}
@@ -98,8 +98,8 @@ def test_evaluate_and_simulate_use_the_learned_model(learned, capsys):
     assert "trajectory relative error" in capsys.readouterr().out
     measures = json.loads((learned / "evaluation.json").read_text())
     assert measures["trajectories"] == 2
-    command("simulate", "cp3", "--run-folder", learned, "--trajectories", 2, "--steps", 5, "--out", "own.npz")
-    own = carom.load_recording("own.npz", task="cp3")
+    command("simulate", "throw", "--run-folder", learned, "--trajectories", 2, "--steps", 5, "--out", "own.npz")
+    own = carom.load_recording("own.npz", task="throw")
     assert own.x.shape == (2, 6, 3, 2)
     assert "model.carom" in own.source
 
@@ -118,8 +118,8 @@ def test_simulate_writes_a_trajectory_file(capsys):
 
 def test_simulate_with_another_contact_model(capsys):
     options = ("--trajectories", 40, "--steps", 30)
-    command("simulate", "bp5", *options, "--contact-model", "lcp", "--compensation-steps", "None", "--out", "lcp.h5")
-    command("simulate", "bp5", *options, "--out", "cm.h5")
+    command("simulate", "throw", *options, "--contact-model", "lcp", "--compensation-steps", "None", "--out", "lcp.h5")
+    command("simulate", "throw", *options, "--out", "cm.h5")
     lcp, cm = (carom.load_recording(f"{name}.h5") for name in ("lcp", "cm"))
     assert "contact model lcp" in lcp.source
     assert np.array_equal(lcp.x[:, 0], cm.x[:, 0])
@@ -157,7 +157,7 @@ def test_bad_arguments_are_one_clear_line(capsys, tmp_path):
     out = tmp_path / "file" / "run"
     assert "cannot make the run folder" in refused(capsys, "learn", "cp3", "--out", out, "--trajectories", 8)
     assert "trajectories must be at least 1" in refused(capsys, "simulate", "cp3", "--trajectories", 0)
-    assert "dt must be a positive" in refused(capsys, "simulate", "cp3", "--dt", 0, "--trajectories", 1)
+    assert "dt must be a positive" in refused(capsys, "simulate", "throw", "--dt", 0, "--trajectories", 1)
     assert "cannot be written" in refused(
         capsys, "simulate", "cp3", "--trajectories", 1, "--steps", 2, "--out", tmp_path / "no" / "x.h5"
     )
@@ -218,7 +218,7 @@ def test_a_killed_training_goes_on_where_it_was(tmp_path):
     run = Path(tmp_path / "run")
     options = [*TINY, "--out", str(run)]
     options[options.index("--epochs") + 1] = "40"
-    start = [sys.executable, "-m", "carom.cli.main", "learn", "cp3", *options]
+    start = [sys.executable, "-m", "carom.cli.main", "learn", "throw", *options]
     environment = {
         **os.environ,
         "CAROM_CACHE": str(tmp_path / "cache"),

@@ -16,7 +16,7 @@ from carom.contact.impulses import CONTACT_MODELS
 from carom.learning.dataset import Chunks, contact_flags
 from carom.learning.model_file import read_model_header
 from carom.learning.run import RunFolder
-from carom.learning.train import fresh_state, learn, train_step
+from carom.learning.train import Rates, fresh_state, learn, train_step
 from carom.simulation.rollout import Stepper, simulate
 
 TINY = carom.LearnConfig(
@@ -87,6 +87,7 @@ def test_cmr_solves_both_phases_with_a_larger_diagonal(family):
 EPSILONS = (1e-2, 1e-4, 1e-7)
 
 
+@pytest.mark.slow
 def test_cmr_becomes_cm_as_epsilon_vanishes():
     problem = problems("gaussian", 2)
     state = state_of(problem)
@@ -246,11 +247,12 @@ def test_a_training_step_with_lcp_has_finite_gradients(cp3, cp3_data):
     chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.chunk_length)
     drawn = chunks.draw(np.random.default_rng(0), config.batch_size, 1.0)
     assert chunks.count()[1] > 0
-    state, optimizer = fresh_state(skeleton, config, 10)
+    state = fresh_state(skeleton, config)
     stepper = Stepper(dt=jnp.asarray(train.dt), project=False)
+    rates = Rates.of(config, config.learning_rate)
     data = (skeleton, jnp.asarray(train.x), jnp.asarray(train.v), *map(jnp.asarray, drawn))
     new, _, error, overflow, bad = train_step(
-        data, state.unknowns, state.optimizer, optimizer, stepper, config.chunk_length, jnp.asarray(0.1)
+        data, state.unknowns, state.optimizer, rates, stepper, config.chunk_length, jnp.asarray(0.1)
     )
     assert not bad  # neither the loss nor a gradient
     assert np.isfinite(error)

@@ -15,6 +15,10 @@ ROOM = 6
 BATCH = 200  # of the smaller problems, with room for two contacts: one shape, which is compiled once
 
 
+IN_3D = pytest.param(3, marks=pytest.mark.slow)
+"""For tests whose point is the same in each dimension: another compilation."""
+
+
 @jax.jit
 def _solve(*arrays):
     return solve_lcp_impulse(*arrays)
@@ -125,7 +129,7 @@ def test_every_plastic_impact_is_solved(d):
         assert np.max(residual) <= 1e-8
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, IN_3D])
 def test_restitution_is_solved_or_the_residual_says_that_it_was_not(d):
     A, v, friction, rebound, _ = battery(d, batch=256)
     f, residual = solved(A, v, friction, rebound)
@@ -158,7 +162,7 @@ def test_a_body_squeezed_by_two_rebounds_is_reported_and_stays_finite():
     assert all(np.isfinite(g).all() and np.abs(g).max() < 1e6 for g in gradient)
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, IN_3D])
 def test_padding_and_batches_change_nothing(d):
     A, v, friction, _, _ = battery(d, batch=BATCH // len(FAMILIES), room=2)
     rebound = np.zeros_like(friction)
@@ -214,7 +218,7 @@ def _cone_model(A, v, friction, restitution):
     return sum(carom.contact_impulse(A, v, friction, restitution, jnp.zeros_like(v)))
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, IN_3D])
 def test_frictionless_plastic_impacts_are_those_of_the_cone_solver(d):
     A, v, friction, _, _ = battery(d, batch=BATCH // len(FAMILIES), room=2)
     zero = np.zeros_like(friction)
@@ -230,7 +234,7 @@ def test_frictionless_plastic_impacts_are_those_of_the_cone_solver(d):
     assert np.median(difference) <= 1e-9
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, IN_3D])
 def test_a_point_mass_bounces_as_by_poissons_hypothesis(d):
     """Frictionless or sticking. (Where it slides, the convex model CM lifts it off by mu times the slip.)"""
     rng = np.random.default_rng(2)
@@ -360,6 +364,7 @@ def test_derivative_where_the_impulse_does_not_tell_the_mode():
     np.testing.assert_allclose(derivative, np.tile(-np.eye(3), (3, 1, 1)), atol=1e-9)  # the ridge's trace
 
 
+@pytest.mark.slow
 def test_derivative_with_redundant_contacts():
     """A box that lands flat on its four corners comes to rest, also after any small change of its motion."""
     corners = np.array([[x, y] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])

@@ -129,8 +129,8 @@ def test_data_that_do_not_fit_the_system_are_refused(cp3, cp3_data):
     with refused("chunk_length is 200"):
         learn(cp3, cp3_data, dataclasses.replace(TINY, chunk_length=200), progress=False)
     bp5 = carom.task("bp5-e")
-    inside = carom.make_recording(bp5, jax.random.key(0), 4)
-    moved = carom.Recording.of(inside.x - 0.5, inside.v, dt=inside.dt)
+    x0, v0 = carom.sample(bp5, jax.random.key(0), 4)
+    moved = carom.Recording.of(*(np.repeat(a[:, None], 9, axis=1) for a in (x0 - 0.5, v0)), dt=0.01)
     with refused("in a wall"):
         learn(bp5, Dataset(moved, moved), TINY, progress=False)
 

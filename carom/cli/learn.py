@@ -83,6 +83,7 @@ class Learn:
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
         folder = self._folder()
         if not self.resume:
+            RunFolder.check_new(folder)
             dataset, test = self._data(truth, console)
             run = RunFolder.create(folder, self._description())
             save_recording(run.path / TEST_DATA, test)

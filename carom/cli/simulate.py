@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
+from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.arguments import CompensationSteps, ContactModelName, FilePath, FolderPath, TaskName
 from carom.learning.dataset import recording_of
@@ -69,6 +70,7 @@ class Simulate:
             )
         require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
         out = Path(f"{self.task}.h5") if self.out is None else self.out
+        check_writable(out)
         if self.initial is not None:
             first = load_recording(self.initial, task=self.task)
             x0, v0 = jnp.asarray(first.x[:, 0]), jnp.asarray(first.v[:, 0])

@@ -115,7 +115,7 @@ def identify(
         dt=jnp.asarray(recording.dt),
         formulation=formulation,
         project=project,
-        compensation_steps=None if compensation_steps is None else float(compensation_steps),
+        compensation_steps=None if compensation_steps is None else jnp.asarray(compensation_steps, float),
     )
     unknowns = unknowns_of(system, learned)
     impacts = closing(recording, system)

@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from carom.atomic import write_whole
@@ -30,17 +31,32 @@ class RunFolder:
         self.path = Path(path)
         self._manager: Any = None
 
+    @staticmethod
+    def check_new(path: str | os.PathLike) -> None:
+        """Raise at once what `create` would raise after long work.
+
+        **Raises:** `CaromError` if the folder already holds a run, or cannot be made.
+        """
+        path = Path(path)
+        require(
+            not (path / CONFIG).exists(),
+            f"the folder {path} already holds a run. Choose another with --out, or go on with it with --resume.",
+        )
+        there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        require(
+            there.is_dir() and os.access(there, os.W_OK | os.X_OK),
+            f"cannot make the run folder {path}: {there} is "
+            f"{'not writable' if there.is_dir() else 'not a folder'}. Choose another with --out.",
+        )
+
     @classmethod
     def create(cls, path: str | os.PathLike, config: dict[str, Any]) -> "RunFolder":
         """A new folder with its configuration.
 
         **Raises:** `CaromError` if it already holds a run, or cannot be written.
         """
+        cls.check_new(path)
         run = cls(path)
-        require(
-            not (run.path / CONFIG).exists(),
-            f"the folder {run.path} already holds a run. Choose another with --out, or go on with it with --resume.",
-        )
         try:
             run.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -143,7 +159,8 @@ class RunFolder:
             ) from error
         arrays, rest = eqx.partition(like, eqx.is_array)
         flat, structure = jax.tree.flatten(arrays)
-        values = [restored[f"{k:04d}"] for k in range(len(flat))]
+        # Without orbax's placement on a device, so that the programs compiled for fresh arrays take them.
+        values = [jnp.asarray(np.asarray(restored[f"{k:04d}"])) for k in range(len(flat))]
         return eqx.combine(jax.tree.unflatten(structure, values), rest)
 
     def close(self) -> None:

@@ -2,16 +2,15 @@
 
 import contextlib
 import dataclasses
-import functools
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from carom.checks import require
 from carom.contact.impulses import CMr, ContactModel
@@ -109,19 +108,25 @@ def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
     return optax.cosine_decay_schedule(config.learning_rate, steps, exponent=2.0)
 
 
-def make_optimizer(config: LearnConfig, steps: int) -> optax.GradientTransformation:
-    """AdamW with a decaying rate: weight decay for networks alone, a rate of their own for the properties.
+class Rates(NamedTuple):
+    """What the optimiser's steps are multiplied by. Data, not part of the program: all trainings share one."""
 
-    The same object for the same configuration, so that `train_step` is compiled once for all trainings like it.
-    """
-    return _optimizer(dataclasses.replace(config, seed=0), steps)
+    learning_rate: Float[Array, ""]  # of the networks, now
+    property_share: Float[Array, ""]  # that of masses, friction and restitution over it
+    weight_decay: Float[Array, ""]  # of the networks
+
+    @classmethod
+    def of(cls, config: LearnConfig, learning_rate: ArrayLike) -> "Rates":
+        share = config.property_learning_rate / config.learning_rate
+        # Single precision, so that networks in single precision stay what they are.
+        return cls(*(jnp.asarray(a, jnp.float32) for a in (learning_rate, share, config.weight_decay)))
 
 
-@functools.cache
-def _optimizer(config: LearnConfig, steps: int) -> optax.GradientTransformation:
+def make_optimizer(rates: Rates) -> optax.GradientTransformation:
+    """AdamW: weight decay for networks alone, a rate of their own for the properties."""
     return optax.chain(
-        optax.adamw(learning_rate_schedule(config, steps), weight_decay=config.weight_decay, mask=_is_network),
-        optax.masked(optax.scale(config.property_learning_rate / config.learning_rate), _is_property),
+        optax.adamw(rates.learning_rate, weight_decay=rates.weight_decay, mask=_is_network),
+        optax.masked(optax.scale(rates.property_share), _is_property),
     )
 
 
@@ -192,14 +197,14 @@ def gather_chunks(x, v, trajectory, start, length: int):
 
 
 @eqx.filter_jit
-def train_step(data, unknowns, opt_state, optimizer, stepper, length, width):
+def train_step(data, unknowns, opt_state, rates: Rates, stepper, length, width):
     """One step of the optimiser. A step whose gradient is not finite is left out and counted."""
     skeleton, x, v, trajectory, start = data
     chunk = gather_chunks(x, v, trajectory, start, length)
     gradient = eqx.filter_value_and_grad(chunk_loss, has_aux=True)
     (loss, (error, overflow)), grads = gradient(unknowns, skeleton, stepper, *chunk, width)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes its counters with floats
-        updates, new_state = optimizer.update(grads, opt_state, eqx.filter(unknowns, eqx.is_inexact_array))
+        updates, new_state = make_optimizer(rates).update(grads, opt_state, eqx.filter(unknowns, eqx.is_inexact_array))
     new = eqx.apply_updates(unknowns, updates).project()
     finite = jnp.isfinite(loss)
     for leaf in jax.tree.leaves(grads):
@@ -220,15 +225,14 @@ def validate(unknowns, skeleton, x, v, stepper):
     return jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v))
 
 
-def fresh_state(skeleton: System, config: LearnConfig, steps: int) -> tuple[TrainState, optax.GradientTransformation]:
-    """The state before the first epoch, and the optimiser."""
+def fresh_state(skeleton: System, config: LearnConfig) -> TrainState:
+    """The state before the first epoch."""
     unknowns = initial_unknowns(skeleton, config)
-    optimizer = make_optimizer(config, steps)
     with jax.numpy_dtype_promotion("standard"):
-        opt_state = optimizer.init(eqx.filter(unknowns, eqx.is_inexact_array))
+        opt_state = make_optimizer(Rates.of(config, 0)).init(eqx.filter(unknowns, eqx.is_inexact_array))
     zero = jnp.asarray(0)
     infinity = jnp.asarray(jnp.inf)
-    return TrainState(unknowns, opt_state, unknowns, infinity, zero, zero, zero, zero), optimizer
+    return TrainState(unknowns, opt_state, unknowns, infinity, zero, zero, zero, zero)
 
 
 def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
@@ -313,7 +317,7 @@ def learn(
     smooth, impact = chunks.count()
     require(smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from.")
     steps = -(-config.chunks_per_epoch // config.batch_size)  # in an epoch
-    state, optimizer = fresh_state(skeleton, config, config.epochs * steps)
+    state = fresh_state(skeleton, config)
     restored = run.restore_checkpoint(state) if run is not None else None
     if run is not None and restored is not None:
         state = restored
@@ -322,7 +326,7 @@ def learn(
         dt=jnp.asarray(train.dt),
         formulation=FORMULATIONS[config.model],
         project=config.project,
-        compensation_steps=None if config.compensation_steps is None else float(config.compensation_steps),
+        compensation_steps=None if config.compensation_steps is None else jnp.asarray(config.compensation_steps, float),
     )
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
     speed = float(np.sqrt(np.mean(train.v[np.arange(train.v.shape[1]) < train.length[:, None]] ** 2)))
@@ -339,7 +343,7 @@ def learn(
     stopped = False
     with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
-            state, loss = _epoch(state, epoch, trained, x, v, chunks, optimizer, stepper, width(epoch), config)
+            state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
             val_loss = validate(state.unknowns, trained, *held_out, stepper)
             state = _keep_best(state, val_loss, epoch)
             metrics = {
@@ -390,17 +394,18 @@ def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
     return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.states)
 
 
-def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, optimizer, stepper, width, config):
+def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, rate, stepper, width, config):
     """Learn from `chunks_per_epoch` new chunks. Their choice depends on seed and epoch alone, so that it can resume."""
     rng = np.random.default_rng((config.seed, 0, epoch))
     unknowns, opt_state = state.unknowns, state.optimizer
     losses, overflow, skipped = [], state.overflow, state.skipped
     drawn = chunks.draw(rng, config.chunks_per_epoch, config.contact_share)
-    for first in range(0, config.chunks_per_epoch, config.batch_size):
+    done = (epoch - 1) * -(-config.chunks_per_epoch // config.batch_size)
+    for count, first in enumerate(range(0, config.chunks_per_epoch, config.batch_size)):
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
         data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
         unknowns, opt_state, loss, over, bad = train_step(
-            data, unknowns, opt_state, optimizer, stepper, config.states, width
+            data, unknowns, opt_state, Rates.of(config, rate(done + count)), stepper, config.states, width
         )
         losses.append(loss)
         overflow, skipped = overflow + over, skipped + bad.astype(skipped.dtype)

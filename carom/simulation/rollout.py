@@ -54,7 +54,7 @@ class Stepper(eqx.Module):
     formulation: Formulation = eqx.field(static=True, default="lagrangian")
     solver: diffrax.AbstractSolver = eqx.field(default_factory=RK4)
     project: bool = eqx.field(static=True, default=True)
-    compensation_steps: float | None = eqx.field(static=True, default=COMPENSATION_STEPS)
+    compensation_steps: Float[Array, ""] | None = eqx.field(default_factory=lambda: jnp.asarray(COMPENSATION_STEPS))
     smoothing: float = eqx.field(static=True, default=0.0)
     contact: bool = eqx.field(static=True, default=True)
 
@@ -242,7 +242,7 @@ def simulate(
         formulation=formulation,
         solver=RK4() if solver is None else solver,
         project=project,
-        compensation_steps=None if compensation_steps is None else float(compensation_steps),
+        compensation_steps=None if compensation_steps is None else jnp.asarray(compensation_steps, x0.dtype),
         smoothing=smoothing,
     )
     out = _simulate(system, x0, v0, stepper, int(steps), force)
