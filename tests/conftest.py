@@ -65,6 +65,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason=reason))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_programs_of_one_file():
+    """Lets go of compiled programs, which are gigabytes by the end of a run; few are used by two files."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def reference_dir() -> Path:
     """The folder of recorded data that carom did not make; skips where it is not at hand."""

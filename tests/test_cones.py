@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cone_problems import FAMILIES, TINY, clarabel_solution, generate, kkt_residual, objective, problem_scale
+from cone_problems import FAMILIES, TINY, apply, clarabel_solution, generate, kkt_residual, objective, problem_scale
 
 import carom
 from carom.contact.cones import solve_cone_problem
@@ -161,7 +161,9 @@ def test_padding_and_batches_without_contact_are_left_alone():
         return jnp.asarray(np.pad(x, ((0, 0), (0, 2)) + ((0, 0),) * (x.ndim - 2)))
 
     padded = SOLVE(jnp.asarray(wide), pad(v), pad(friction), pad(lower)).impulse
-    assert np.allclose(padded[:, :2], alone, atol=1e-9)
+    # What they do is the same. Impulses may differ where A is singular, within the tolerance of the conditions.
+    difference = apply(A, padded[:, :2] - alone)
+    assert np.all(np.abs(difference).max((1, 2)) <= 1e-8 * np.abs(v).max((1, 2)))
     assert not padded[:, 2:].any()
     nothing = SOLVE(jnp.zeros((512, 8, 8)), *(jnp.zeros((512, *s)) for s in ((4, 2), (4,), (4,))))
     assert not nothing.impulse.any()

@@ -1,4 +1,4 @@
-"""The trainer: it learns, it resumes, it refuses; and the paper's quantities at full length (slow)."""
+"""The trainer: it learns, it resumes, it refuses. What it comes to is in `test_acceptance.py`."""
 
 import dataclasses
 
@@ -133,52 +133,6 @@ def test_data_that_do_not_fit_the_system_are_refused(cp3, cp3_data):
     moved = carom.Recording.of(*(np.repeat(a[:, None], 9, axis=1) for a in (x0 - 0.5, v0)), dt=0.01)
     with refused("in a wall"):
         learn(bp5, Dataset(moved, moved), TINY, progress=False)
-
-
-# --- the paper's tasks at full length -------------------------------------------------------------
-
-
-def full_dataset(task, *, n=800, seed=0):
-    system = carom.task(task)
-    train, val = (carom.make_recording(system, jax.random.key(seed + k), count) for k, count in enumerate((n, n // 8)))
-    return system, Dataset(train, val)
-
-
-def check_learned(system, truth, *, properties=1e-3, masses=1e-3):
-    assert np.abs(system.friction - truth.friction).max() < properties
-    assert np.abs(system.restitution - truth.restitution).max() < properties
-    assert np.abs(mass_ratios(system) / mass_ratios(truth) - 1).max() < masses
-
-
-@pytest.mark.slow
-@pytest.mark.ci_budget
-@pytest.mark.timeout(800)
-def test_cp3_is_learned_from_its_own_data():
-    truth, dataset = full_dataset("cp3")
-    system, _ = learn(truth, dataset, progress=False)
-    check_learned(system, truth)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize(
-    ("task", "model"),
-    [("cp3-e", "clnn"), ("bp5-e", "clnn"), ("cp3", "chnn")],
-    ids=["cp3-e", "bp5-e", "cp3 Hamiltonian"],
-)
-def test_elastic_tasks_and_the_hamiltonian_network(task, model):
-    truth, dataset = full_dataset(task)
-    system, _ = learn(truth, dataset, carom.LearnConfig(model=model), progress=False)
-    check_learned(system, truth)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_cp3_is_learned_from_recordings_carom_did_not_make(reference_dir):
-    truth = carom.task("cp3")
-    data = carom.load_recording(reference_dir / "reference" / "cp3_observed.npz", task="cp3")
-    system, _ = learn(truth, Dataset.split(data), progress=False)
-    check_learned(system, truth)
 
 
 def test_single_precision_trains():

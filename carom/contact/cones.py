@@ -351,8 +351,9 @@ def solve_cone_problem(
     relative to the problem's scale. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
     A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is
-    the one of least norm. The iterations run in double precision where that is enabled, whatever the dtype of the
-    data. Differentiable once, in forward and reverse mode.
+    the one of least norm, but for degenerate problems that only the proximal rounds solve: of these it is one near it.
+    The iterations run in double precision where that is enabled, whatever the dtype of the data. Differentiable once,
+    in forward and reverse mode.
 
     **Source:** paper, eqs. 5 and 7, appendix C; method: Vandenberghe, *The CVXOPT linear and quadratic cone program
     solvers*, 2010.

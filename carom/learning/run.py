@@ -160,7 +160,7 @@ class RunFolder:
         arrays, rest = eqx.partition(like, eqx.is_array)
         flat, structure = jax.tree.flatten(arrays)
         # Without orbax's placement on a device, so that the programs compiled for fresh arrays take them.
-        values = [jnp.asarray(np.asarray(restored[f"{k:04d}"])) for k in range(len(flat))]
+        values = [jnp.asarray(np.asarray(restored.get(f"{k:04d}", leaf))) for k, leaf in enumerate(flat)]
         return eqx.combine(jax.tree.unflatten(structure, values), rest)
 
     def close(self) -> None:
@@ -171,7 +171,9 @@ class RunFolder:
 
 
 def _leaves(tree: Any) -> dict[str, jax.Array]:
-    return {f"{k:04d}": leaf for k, leaf in enumerate(jax.tree.leaves(eqx.filter(tree, eqx.is_array)))}
+    """The arrays of a tree by their number. Those without elements, which orbax refuses, are left out."""
+    leaves = enumerate(jax.tree.leaves(eqx.filter(tree, eqx.is_array)))
+    return {f"{k:04d}": leaf for k, leaf in leaves if leaf.size}
 
 
 def _finite(value: Any) -> Any:

@@ -1,0 +1,53 @@
+"""What carom promises of learning, at full length: friction, restitution and mass ratios of the paper's tasks."""
+
+import jax
+import numpy as np
+import pytest
+
+import carom
+from carom.learning.dataset import Dataset
+from carom.learning.models import mass_ratios
+from carom.learning.train import learn
+
+
+def full_dataset(task, *, n=800, seed=0):
+    system = carom.task(task)
+    train, val = (carom.make_recording(system, jax.random.key(seed + k), count) for k, count in enumerate((n, n // 8)))
+    return system, Dataset(train, val)
+
+
+def check_learned(system, truth, *, properties=1e-3, masses=1e-3):
+    assert np.abs(system.friction - truth.friction).max() < properties
+    assert np.abs(system.restitution - truth.restitution).max() < properties
+    assert np.abs(mass_ratios(system) / mass_ratios(truth) - 1).max() < masses
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.timeout(800)
+def test_cp3_is_learned_from_its_own_data():
+    truth, dataset = full_dataset("cp3")
+    system, _ = learn(truth, dataset, progress=False)
+    check_learned(system, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize(
+    ("task", "model"),
+    [("cp3-e", "clnn"), ("bp5-e", "clnn"), ("cp3", "chnn")],
+    ids=["cp3-e", "bp5-e", "cp3 Hamiltonian"],
+)
+def test_elastic_tasks_and_the_hamiltonian_network(task, model):
+    truth, dataset = full_dataset(task)
+    system, _ = learn(truth, dataset, carom.LearnConfig(model=model), progress=False)
+    check_learned(system, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_cp3_is_learned_from_recordings_carom_did_not_make(reference_dir):
+    truth = carom.task("cp3")
+    data = carom.load_recording(reference_dir / "reference" / "cp3_observed.npz", task="cp3")
+    system, _ = learn(truth, Dataset.split(data), progress=False)
+    check_learned(system, truth)
