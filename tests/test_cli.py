@@ -221,7 +221,9 @@ def test_a_killed_training_goes_on_where_it_was(tmp_path):
     start = [sys.executable, "-m", "carom.cli.main", "learn", "throw", *options]
     environment = {
         **os.environ,
-        "CAROM_CACHE": str(tmp_path / "cache"),
+        "CAROM_CACHE": "",
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or str(tmp_path / "cache"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
         "PYTHONPATH": str(Path(carom.__file__).parents[1]),
     }
     process = subprocess.Popen(start, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -25,7 +25,7 @@ from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
-from carom.tasks import make_recording, task
+from carom.tasks import make_recordings, task
 
 TEST_DATA = "test.h5"
 QUICK = {"trajectories": 100, "epochs": 20}
@@ -148,18 +148,14 @@ class Learn:
                 require(getattr(self, name) is None, f"{name} needs --data: give the file to train on too.")
             console.print(f"Simulating {self.task} ...", highlight=False)
             held = max(self.trajectories // 8, 2)
-            counts = {"train": self.trajectories, "val": held, "test": held}
-            parts = {
-                name: make_recording(
-                    truth,
-                    jax.random.fold_in(jax.random.key(self.config.seed), k),
-                    count,
-                    contact_model=self.data_contact_model,
-                    compensation_steps=self.config.compensation_steps,
-                )
-                for k, (name, count) in enumerate(counts.items())
-            }
-            return Dataset(parts["train"], parts["val"]), parts["test"]
+            counts = (self.trajectories, held, held)
+            train, val, test = make_recordings(
+                truth,
+                [(jax.random.fold_in(jax.random.key(self.config.seed), k), count) for k, count in enumerate(counts)],
+                contact_model=self.data_contact_model,
+                compensation_steps=self.config.compensation_steps,
+            )
+            return Dataset(train, val), test
         data = load_recording(self.data, task=self.task)
         test = load_recording(self.test, task=self.task) if self.test else None
         if test is None:

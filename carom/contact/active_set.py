@@ -88,6 +88,10 @@ def finish(
 
     A step is kept only where it does not make the residual worse.
     """
+    # Three candidates, each judged by the problem that it should solve.
+    judged = problem._replace(q=jnp.stack([proximal.q, problem.q, problem.q]))
+    diagonal = jnp.stack([jnp.zeros_like(regularization), regularization, regularization])
+    judge = jax.vmap(residual_of, in_axes=(Problem(Q=None, q=0, lower=None), 0, 0))  # pyright: ignore[reportArgumentType]
 
     def keep_going(state):
         *_, residual, count = state
@@ -98,19 +102,16 @@ def finish(
         active = ActiveSet.at(proximal, regular)
         matrix = NewtonMatrix(proximal.Q, active.scaling, active.curvature, active.rhs[:, :, None], unrolled=False)
         polished = regular + matrix.solution[:, :, 0]
-        new_error = residual_of(proximal, polished)
-        improves = new_error <= error
-        regular, error = choose(improves, polished, regular), choose(improves, new_error, error)
-        corrected = regular + matrix.solve(regularization * (regular - center))
-        for y in (regular, corrected):
-            new_residual = residual_of(problem, y, regularization)
+        corrected = polished + matrix.solve(regularization * (polished - center))
+        new_error, *residuals = judge(judged, jnp.stack([polished, regular, corrected]), diagonal)
+        for y, new_residual in zip((regular, corrected), residuals, strict=True):
             improves = new_residual <= jnp.maximum(residual, 1e-4 * wanted)
             solution, residual = choose(improves, y, solution), choose(improves, new_residual, residual)
+        improves = new_error <= error
+        regular, error = choose(improves, polished, regular), choose(improves, new_error, error)
         return regular, error, solution, residual, count + 1
 
-    error = residual_of(proximal, loop.best.y)
-    y = choose(loop.residual < error, loop.y, loop.best.y)
-    start = (y, jnp.minimum(loop.residual, error), y, residual_of(problem, y, regularization), jnp.asarray(0))
+    start = (loop.y, loop.residual, loop.y, jnp.full_like(loop.residual, jnp.inf), jnp.asarray(0))
     regular, _, solution, residual, _ = jax.lax.while_loop(keep_going, body, start)
     return regular, solution, residual
 

@@ -107,15 +107,18 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
     A_last = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
     v_last, reference = jnp.moveaxis(v, 0, -1), jnp.moveaxis(reference, 0, -1)
     problem, scales = scale(A_last, v_last, friction.T, lower.T, reference, settings.diagonal)
-    way = _short_way if short else _long_way
-    out, matrix = way(problem, scales, settings)
+    if short:
+        out, matrix = _short_way(problem, scales, settings)
+    else:
+        out = _proximal_point(problem, scales, settings)
+        matrix = _last_matrix(problem, scales, settings, out) if sensitivity else None
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
     solution = _Internal(
         impulse=jnp.moveaxis(scales.S * scales.unit * out.y + nan, -1, 0),
         residual=jnp.where(finite, out.residual, jnp.inf),
         iterations=jnp.broadcast_to(out.iterations, (batch,)),
     )
-    if not sensitivity:
+    if not sensitivity or matrix is None:
         return solution, None
     size = scales.size[:, None]
     return solution, _Sensitivity(
@@ -139,11 +142,13 @@ _CLEAR = 1e3  # times the diagonal
 
 def _short_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, Factored]:
     last = newton_steps(problem, sweep(problem, scales.mu), scales.regularization, scales.apex)
-    unique = (last.margin > _CLEAR * settings.diagonal) | (
-        residual_of(problem, last.regular) < settings.diagonal / _CLEAR
+    of_regular, of_solution = jax.vmap(residual_of, in_axes=(None, 0, 0))(
+        problem,
+        jnp.stack([last.regular, last.y]),
+        jnp.stack([jnp.zeros_like(scales.regularization), scales.regularization]),
     )
-    residual = residual_of(problem, last.y, scales.regularization)
-    residual = jnp.where(unique & (residual <= _wanted(settings)), residual, jnp.inf)
+    unique = (last.margin > _CLEAR * settings.diagonal) | (of_regular < settings.diagonal / _CLEAR)
+    residual = jnp.asarray(jnp.where(unique & (of_solution <= _wanted(settings)), of_solution, jnp.inf))
     zero = jnp.asarray(0)
     return _Solved(_start(problem), last.regular, jnp.zeros_like(last.y), last.y, residual, zero, zero), last.matrix
 
@@ -173,14 +178,14 @@ def _start(problem: Problem) -> Iterate:
     return Iterate(y, y[:, 0] - problem.lower, identity, one)
 
 
-def _long_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, Factored]:
-    found = _proximal_point(problem, scales, settings)
+def _last_matrix(problem: Problem, scales: Scales, settings: ConeSettings, found: _Solved) -> Factored:
+    """That of a step from the solution: what the derivative is made of."""
     if settings.smoothing > 0:
         scaling, bound = Scaling.of(found.it.y, found.it.z), found.it.w / found.it.u
     else:
         active = ActiveSet.at(problem, found.regular, scales.apex)
         scaling, bound = active.scaling, active.curvature
-    return found, NewtonMatrix(problem.Q, scaling, bound, unrolled=False).factored()
+    return NewtonMatrix(problem.Q, scaling, bound, unrolled=False).factored()
 
 
 def _proximal_point(problem: Problem, scales: Scales, settings: ConeSettings) -> _Solved:

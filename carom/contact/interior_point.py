@@ -158,7 +158,8 @@ def interior_point(
         residual = jnp.where(nearer, residual, loop.residual)
         return Loop(it, best, merit, y, residual, stalled, done, loop.iteration + 1)
 
-    merit, residual = _merit(problem, start, smoothing), residual_of(problem, start.y)
+    # What the start is worth is not looked at: the first iterate is better.
+    worst = jnp.full(batch, jnp.inf, problem.q.dtype)
     zero = jnp.zeros(batch, int)
-    loop = Loop(start, start, merit, start.y, residual, zero, solved, jnp.asarray(0))
+    loop = Loop(start, start, worst, start.y, worst, zero, solved, jnp.asarray(0))
     return jax.lax.while_loop(keep_going, body, loop)

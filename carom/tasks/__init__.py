@@ -2,8 +2,11 @@
 
 import difflib
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from carom.checks import require
@@ -70,14 +73,33 @@ def make_recording(
     **Arguments:** `system`, `key` and `n` as those of `sample`; `contact_model`, in place of the system's own, and
     `compensation_steps` as those of `simulate`.
     """
-    x0, v0 = sample(system, key, n)
+    (recording,) = make_recordings(
+        system, [(key, n)], contact_model=contact_model, compensation_steps=compensation_steps
+    )
+    return recording
+
+
+def make_recordings(
+    system: System,
+    parts: Sequence[tuple[PRNGKeyArray, int]],
+    *,
+    contact_model: str | ContactModel | None = None,
+    compensation_steps: float | None = COMPENSATION_STEPS,
+) -> list[Recording]:
+    """Several recordings, each as by `make_recording` from its key and number, in one simulation.
+
+    The program that simulates is compiled once for each number of trajectories, which takes longer than to run it.
+    """
+    x0, v0 = (jnp.concatenate(states) for states in zip(*(sample(system, *part) for part in parts), strict=True))
     if contact_model is not None:
         system = system.with_contact_model(contact_model)
     chosen = find_task(system.name)
     trajectory = simulate(system, x0, v0, dt=chosen.dt, steps=chosen.steps, compensation_steps=compensation_steps)
     model = contact_model_name(system.contact_model)
     source = "carom" if model == "cm" else f"carom, contact model {model or 'of its own'}"
-    return recording_of(trajectory, task=system.name, source=source)
+    whole = recording_of(trajectory, task=system.name, source=source)
+    ends = np.cumsum([n for _, n in parts])
+    return [whole.select(np.arange(end - n, end)) for end, (_, n) in zip(ends, parts, strict=True)]
 
 
 def load_model(path: str | os.PathLike, skeleton: System | None = None) -> System:
