@@ -130,7 +130,7 @@ class Reversal(ContactModel):
 @pytest.mark.parametrize(
     ("task", "name"),
     [
-        pytest.param(task, name, marks=pytest.mark.ci_budget if (task, name) == ("rope", "in-cp-clnn") else ())
+        pytest.param(task, name, marks=pytest.mark.ci_budget if (task, name) == ("rope", "in-cp-sp") else ())
         for task in ("cp3", "bp5-e", "gyro", "rope")
         for name in BASELINES
     ],

@@ -116,6 +116,7 @@ def test_simulate_writes_a_trajectory_file(capsys):
     assert "Wrote 3 trajectories of 8 states" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_simulate_with_another_contact_model(capsys):
     options = ("--trajectories", 40, "--steps", 30)
     command("simulate", "throw", *options, "--contact-model", "lcp", "--compensation-steps", "None", "--out", "lcp.h5")

@@ -196,8 +196,7 @@ def before_contact(dataset):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
-@pytest.mark.parametrize("model", ["lcp", "cmr"])
+@pytest.mark.parametrize("model", [pytest.param("lcp", marks=pytest.mark.ci_budget), "cmr"])
 def test_derivatives_through_a_step_of_cp3(model, cp3, cp3_data):
     """By all that states and systems consist of, against differences, for many impacts at once."""
     system = eqx.tree_at(lambda s: s.restitution, cp3.with_contact_model(model), jnp.array([0.4]))

@@ -74,6 +74,7 @@ def test_early_stopping_keeps_the_best(cp3, cp3_data):
     assert report.epochs < 40
 
 
+@pytest.mark.slow
 def test_only_what_is_asked_for_is_learned(cp3, cp3_data):
     config = dataclasses.replace(TINY, learn=("friction", "restitution"), epochs=2)
     system, _ = learn(cp3, cp3_data, config, progress=False)
