@@ -19,6 +19,8 @@ CACHE_DAYS = 14
 assert "carom" not in sys.modules, "carom was imported before tests/conftest.py could instrument it"
 jaxtyping.install_import_hook("carom", "beartype.beartype")
 
+from carom.cli.cache import use_compilation_cache  # noqa: E402 - not before the hook
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -26,18 +28,16 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 def _use_compilation_cache() -> None:
     """Keeps compiled programs between runs, outside of the repository: most of a run's time."""
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    cache = caches / "carom-test-jax"
     try:
-        cache.mkdir(parents=True, exist_ok=True)
+        (caches / "carom-test-jax").mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # no writable home: the tests only take longer
+    cache = use_compilation_cache(caches / "carom-test-jax")
     # jax never removes an entry, and every edit of a function under test leaves one behind.
     oldest = time.time() - CACHE_DAYS * 86_400
-    for entry in cache.glob("*-cache"):
+    for entry in cache.glob("*-cache") if cache is not None else ():
         if entry.stat().st_mtime < oldest:
             entry.unlink(missing_ok=True)
-    jax.config.update("jax_compilation_cache_dir", str(cache))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 _use_compilation_cache()

@@ -1,6 +1,5 @@
 """Entry point of the command `carom`: subcommands, errors in one line, exit codes."""
 
-import hashlib
 import logging
 import os
 import sys
@@ -12,6 +11,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import tyro
 
+from carom.cli.cache import use_compilation_cache
 from carom.cli.evaluate import Evaluate
 from carom.cli.learn import Learn
 from carom.cli.simulate import Simulate
@@ -54,20 +54,9 @@ def configure_jax() -> None:
     jax.config.update("jax_enable_x64", True)
     logging.getLogger("absl").setLevel(logging.ERROR)
     default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "carom"
-    folder, processor = os.environ.get("CAROM_CACHE", str(default)), _processor()
-    if folder and processor:
-        jax.config.update("jax_compilation_cache_dir", str(Path(folder) / processor))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def _processor() -> str:
-    """A name for this kind of processor: programs compiled on one must not run on another. Empty if unknown."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return ""
-    flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    return hashlib.sha256(flags.encode()).hexdigest()[:16] if flags else ""
+    folder = os.environ.get("CAROM_CACHE", str(default))
+    if folder:
+        use_compilation_cache(folder)
 
 
 if __name__ == "__main__":
