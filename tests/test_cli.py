@@ -1,5 +1,6 @@
 """The command line as a user types it: results, files, and one clear line for what is wrong."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -54,19 +55,66 @@ def refused(capsys, *arguments) -> str:
     return lines[0]
 
 
+EPOCHS = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class Killed:
+    """A tiny training on the command line that was killed, and went on."""
+
+    folder: Path
+    start: list[str]
+    environment: dict[str, str]
+    done: int  # epochs before the kill
+
+    def again(self, *options: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*self.start, "--resume", *options], env=self.environment, capture_output=True, text=True, check=False
+        )
+
+
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory):
-    """A run folder of a tiny training."""
-    folder = tmp_path_factory.mktemp("learned")
-    environment = {**os.environ, "CAROM_CACHE": ""}
-    os.environ.update(environment)
-    command("learn", "throw", "--out", folder / "run", *TINY)
-    return folder / "run"
+def killed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("learned") / "run"
+    options = [*TINY, "--out", str(folder)]
+    options[options.index("--epochs") + 1] = str(EPOCHS)
+    start = [sys.executable, "-m", "carom.cli.main", "learn", "throw", *options]
+    environment = {
+        **os.environ,
+        "CAROM_CACHE": "",
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or str(folder.with_name("cache")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+        "PYTHONPATH": str(Path(carom.__file__).parents[1]),
+    }
+    process = subprocess.Popen(start, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 240
+    while len(RunFolder(folder).metrics()) < 5:
+        assert process.poll() is None, "the training ended by itself"
+        assert time.monotonic() < deadline, "no five epochs within four minutes"
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    run = Killed(folder, start, environment, done=RunFolder(folder).metrics()[-1]["epoch"])
+    assert run.done < EPOCHS
+    resumed = run.again()
+    assert resumed.returncode == 0, resumed.stderr
+    return run
 
 
 @pytest.mark.slow
 @pytest.mark.ci_budget
-def test_learn_writes_a_whole_run_folder(learned):
+@pytest.mark.timeout(500)
+def test_a_killed_training_goes_on_where_it_was(killed):
+    assert [m["epoch"] for m in RunFolder(killed.folder).metrics()] == list(range(1, EPOCHS + 1))
+    other = killed.again("--seed", "5")
+    assert other.returncode == 2
+    assert "was started with seed = 0" in other.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_learn_writes_a_whole_run_folder(killed):
+    learned = killed.folder
     names = {p.name for p in learned.iterdir()}
     assert names == {
         "config.json",
@@ -82,8 +130,7 @@ def test_learn_writes_a_whole_run_folder(learned):
         "prediction.gif",
     }
     config = json.loads((learned / "config.json").read_text())
-    assert (config["task"], config["epochs"], config["model"]) == ("throw", 2, "clnn")
-    assert [m["epoch"] for m in RunFolder.open(learned).metrics()] == [1, 2]
+    assert (config["task"], config["epochs"], config["model"]) == ("throw", EPOCHS, "clnn")
     report = json.loads((learned / "report.json").read_text())
     assert set(report) == {"learned", "evaluation", "identification"}
     with Image.open(learned / "prediction.gif") as animation:
@@ -93,7 +140,8 @@ def test_learn_writes_a_whole_run_folder(learned):
 
 @pytest.mark.slow
 @pytest.mark.ci_budget
-def test_evaluate_and_simulate_use_the_learned_model(learned, capsys):
+def test_evaluate_and_simulate_use_the_learned_model(killed, capsys):
+    learned = killed.folder
     command("evaluate", learned)
     assert "trajectory relative error" in capsys.readouterr().out
     measures = json.loads((learned / "evaluation.json").read_text())
@@ -210,38 +258,3 @@ def test_help_shows_every_default(capsys):
     for option in ("--data", "--resume", "--quick", "--epochs", "--learning-rate", "--model"):
         assert option in text
     assert "(default: 250)" in " ".join(text.split())
-
-
-@pytest.mark.slow
-@pytest.mark.ci_budget
-@pytest.mark.timeout(400)
-def test_a_killed_training_goes_on_where_it_was(tmp_path):
-    run = Path(tmp_path / "run")
-    options = [*TINY, "--out", str(run)]
-    options[options.index("--epochs") + 1] = "40"
-    start = [sys.executable, "-m", "carom.cli.main", "learn", "throw", *options]
-    environment = {
-        **os.environ,
-        "CAROM_CACHE": "",
-        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or str(tmp_path / "cache"),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-        "PYTHONPATH": str(Path(carom.__file__).parents[1]),
-    }
-    process = subprocess.Popen(start, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 240
-    while len(RunFolder(run).metrics()) < 5:
-        assert process.poll() is None, "the training ended by itself"
-        assert time.monotonic() < deadline, "no five epochs within four minutes"
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    done = RunFolder(run).metrics()[-1]["epoch"]
-    assert done < 40
-    again = subprocess.run([*start, "--resume"], env=environment, capture_output=True, text=True, check=False)
-    assert again.returncode == 0, again.stderr
-    assert [m["epoch"] for m in RunFolder(run).metrics()] == list(range(1, 41))
-    other = subprocess.run(
-        [*start, "--resume", "--seed", "5"], env=environment, capture_output=True, text=True, check=False
-    )
-    assert other.returncode == 2
-    assert "was started with seed = 0" in other.stderr
