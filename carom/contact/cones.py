@@ -155,7 +155,7 @@ def _short_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tupl
 
 def _wanted(settings: ConeSettings) -> float:
     """The residual at which a problem is solved well enough."""
-    return 0.1 * settings.tolerance
+    return 0.01 * settings.tolerance
 
 
 # --- The long way: the problem as it was given, along the central path -------------------------------------------

@@ -226,7 +226,8 @@ def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: 
     """Steps in which no gap is so near to zero, before or after, that errors of the data decide what is closed."""
     margin = doubt * np.linalg.norm(seen.gap_slope * errors[: seen.gap_slope.shape[2]], axis=-1)
     sure = (seen.gap_before > margin) & (np.abs(seen.gap) > margin)
-    return sure.all(axis=1) & np.isfinite(seen.residual).all(axis=1)
+    finite = np.isfinite(seen.residual).all(axis=1) & np.isfinite(seen.state).all(axis=(1, 2))
+    return sure.all(axis=1) & finite
 
 
 def whitened(seen: StepSensitivity, problem: Problem, errors, kept, bias) -> Blocks:
@@ -244,8 +245,11 @@ def whitened(seen: StepSensitivity, problem: Problem, errors, kept, bias) -> Blo
     residual = seen.residual + seen.features @ bias
     spread = seen.state * errors
     covariance = spread @ spread.transpose(0, 2, 1) + np.diag(errors**2)
-    # In units of the errors, so that positions and velocities are alike in size.
-    factor = np.linalg.cholesky(covariance / (errors[:, None] * errors))
+    # In units of the errors, so that positions and velocities are alike in size. What rounding leaves of a step that
+    # multiplies the errors of its state by 1e7 and more is not positive definite without the last term.
+    covariance = covariance / (errors[:, None] * errors)
+    largest = np.max(np.diagonal(covariance, axis1=1, axis2=2), axis=1)
+    factor = np.linalg.cholesky(covariance + 1e-14 * len(errors) * largest[:, None, None] * np.eye(len(errors)))
     both = np.concatenate([residual[..., None], jacobian], axis=2) / errors[:, None]
     both = np.linalg.solve(factor, both)
     kind = np.any(seen.gap < 0, axis=1).astype(int)
