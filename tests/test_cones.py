@@ -135,6 +135,26 @@ def test_derivatives_agree_with_differences_and_between_modes(redundant):
     assert compared >= 27  # of 30
 
 
+def test_where_a_contact_sticks_friction_changes_no_velocity():
+    """Also where A is singular and the impulse of least norm is on the cone: its multiplier is next to zero there."""
+    rng = np.random.default_rng(6)
+    null = rng.normal(size=(512, 3))
+    null /= np.linalg.norm(null, axis=1)[:, None]
+    A = 6 * (np.eye(3) - null[:, :, None] * null[:, None])
+    inside = np.concatenate([np.ones((512, 1)), 0.2 * rng.uniform(-1, 1, (512, 2))], axis=1)
+    v = -np.einsum("bij,bj->bi", A, inside)[:, None]
+    friction = np.full((512, 1), 0.3)
+
+    def solve(friction):
+        return SOLVE(jnp.asarray(A), jnp.asarray(v), friction, jnp.zeros((512, 1))).impulse
+
+    f, slope = jax.jvp(solve, (jnp.asarray(friction),), (jnp.ones((512, 1)),))
+    on_the_cone = np.linalg.norm(f[:, 0, 1:], axis=1) > 0.3 * (1 - 1e-6) * f[:, 0, 0]
+    assert on_the_cone.sum() > 50
+    assert np.abs(apply(A, f) + v).max() < 1e-7
+    assert np.abs(apply(A, slope)).max() < 1e-5
+
+
 def test_values_can_leave_their_ends():
     """Derivatives at mu = 0 and e = 0 are the one-sided ones: friction, and rebound, that set in.
 

@@ -77,8 +77,8 @@ def choose(condition: Array, a: Array, b: Array) -> Array:
     return jnp.asarray(jnp.where(condition, a, b))
 
 
-# Newton steps onto the active set: each squares the error that the central path has left.
-_FINISHING = 3
+# Most Newton steps onto the active set. Each squares the error that the central path has left, once the set is right.
+_FINISHING = 6
 
 
 def finish(
@@ -86,34 +86,43 @@ def finish(
 ) -> tuple[Array, Array, Array]:
     """From the last iterate to `(solution of the proximal problem, solution of the problem given, its residual)`.
 
-    A step is kept only where it does not make the residual worse.
+    Steps go on from where they lead, also outside of the cones: a contact at its boundary whose multiplier is next to
+    zero is seen to be held only from there. The best is kept.
     """
     # Three candidates, each judged by the problem that it should solve.
     judged = problem._replace(q=jnp.stack([proximal.q, problem.q, problem.q]))
     diagonal = jnp.stack([jnp.zeros_like(regularization), regularization, regularization])
     judge = jax.vmap(residual_of, in_axes=(Problem(Q=None, q=0, lower=None), 0, 0))  # pyright: ignore[reportArgumentType]
 
-    def keep_going(state):
-        *_, residual, count = state
-        return (count < _FINISHING) & jnp.any(residual > 1e-4 * wanted)
+    class Finish(NamedTuple):
+        y: Array
+        regular: Array
+        error: Array  # of `regular`
+        solution: Array
+        residual: Array  # of `solution`
+        steps: Array
 
-    def body(state: tuple[Array, Array, Array, Array, Array]):
-        regular, error, solution, residual, count = state
-        active = ActiveSet.at(proximal, regular)
+    def keep_going(best: Finish):
+        return (best.steps < _FINISHING) & jnp.any(jnp.maximum(best.residual, best.error) > 1e-4 * wanted)
+
+    def body(best: Finish) -> Finish:
+        active = ActiveSet.at(proximal, best.y)
         matrix = NewtonMatrix(proximal.Q, active.scaling, active.curvature, active.rhs[:, :, None], unrolled=False)
-        polished = regular + matrix.solution[:, :, 0]
+        polished = best.y + matrix.solution[:, :, 0]
         corrected = polished + matrix.solve(regularization * (polished - center))
-        new_error, *residuals = judge(judged, jnp.stack([polished, regular, corrected]), diagonal)
-        for y, new_residual in zip((regular, corrected), residuals, strict=True):
+        new_error, *residuals = judge(judged, jnp.stack([polished, best.y, corrected]), diagonal)
+        solution, residual = best.solution, best.residual
+        for y, new_residual in zip((best.y, corrected), residuals, strict=True):
             improves = new_residual <= jnp.maximum(residual, 1e-4 * wanted)
             solution, residual = choose(improves, y, solution), choose(improves, new_residual, residual)
-        improves = new_error <= error
-        regular, error = choose(improves, polished, regular), choose(improves, new_error, error)
-        return regular, error, solution, residual, count + 1
+        improves = new_error <= best.error
+        regular, error = choose(improves, polished, best.regular), choose(improves, new_error, best.error)
+        return Finish(polished, regular, error, solution, residual, best.steps + 1)
 
-    start = (loop.y, loop.residual, loop.y, jnp.full_like(loop.residual, jnp.inf), jnp.asarray(0))
-    regular, _, solution, residual, _ = jax.lax.while_loop(keep_going, body, start)
-    return regular, solution, residual
+    nothing_yet = jnp.full_like(loop.residual, jnp.inf)
+    start = Finish(loop.y, loop.y, loop.residual, loop.y, nothing_yet, jnp.asarray(0))
+    best = jax.lax.while_loop(keep_going, body, start)
+    return best.regular, best.solution, best.residual
 
 
 # --- Without the central path -----------------------------------------------------------------------------------

@@ -146,12 +146,13 @@ class Factored(NamedTuple):
     triangle: Float[Array, "B n n"]  # L
     frame: Float[Array, "K d d B"]
     curvature: Float[Array, "K B"]  # D, of the bounds
+    sticks: Bool[Array, "K B"]  # contacts inside of their cone: W^-2 = 0
 
     @classmethod
     def nothing(cls, k: int, d: int, batch: int, dtype) -> "Factored":
         n = k * d
         zeros = jnp.zeros((k, d, d, batch), dtype)
-        return cls(jnp.zeros((batch, n, n), dtype), zeros, zeros[:, 0, 0])
+        return cls(jnp.zeros((batch, n, n), dtype), zeros, zeros[:, 0, 0], jnp.zeros((k, batch), bool))
 
 
 class NewtonMatrix:
@@ -176,6 +177,7 @@ class NewtonMatrix:
         eye = jnp.eye(d, dtype=Q.dtype)[..., None]
         plain = scaling.along_tangent()
         self.curvature = curvature
+        self.sticks = jnp.all(scaling.inverse == 0, axis=1)
         self.frame = jnp.where(rotated, jnp.sum(plain[:, :, :, None] * turn, axis=2), plain)
         H = self.rotate(Q.reshape(k, d, k * d, batch)).reshape(k * d, k * d, batch).swapaxes(0, 1)
         H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
@@ -195,7 +197,7 @@ class NewtonMatrix:
             self.solution = self.restore(self.factor.solution.reshape(rhs.shape))
 
     def factored(self) -> Factored:
-        return Factored(self.factor.triangle(), self.frame, self.curvature)
+        return Factored(self.factor.triangle(), self.frame, self.curvature, self.sticks)
 
     def rotate(self, x: Float[Array, "K d *m B"]) -> Float[Array, "K d *m B"]:
         """Components along the frame's axes."""

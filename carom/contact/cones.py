@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.active_set import ActiveSet, finish, newton_steps, sweep
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
@@ -70,13 +70,15 @@ class _Sensitivity(NamedTuple):
     frame: Float[Array, "B K d d"]
     bound: Float[Array, "B K"]  # D
     diagonal: Float[Array, " B"]  # delta
+    sticks: Bool[Array, "B K"]  # contacts inside of their cone, so that z = 0
 
     @classmethod
     def nothing(cls, batch: int, k: int, d: int, dtype) -> "_Sensitivity":
         """That of problems without contacts."""
         zeros = jnp.zeros((batch, k, d), dtype)
         triangle = jnp.broadcast_to(jnp.eye(k * d, dtype=dtype), (batch, k * d, k * d))
-        return cls(zeros, zeros, triangle, jnp.zeros((batch, k, d, d), dtype), zeros[..., 0], zeros[:, 0, 0])
+        frame, sticks = jnp.zeros((batch, k, d, d), dtype), jnp.zeros((batch, k), bool)
+        return cls(zeros, zeros, triangle, frame, zeros[..., 0], zeros[:, 0, 0], sticks)
 
     def solve(self, rhs: Float[Array, "B K d"]) -> Float[Array, "B K d"]:
         """`(Q + W^-2 + D)^-1 rhs`; linear in `rhs`, in both modes."""
@@ -128,6 +130,7 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
         frame=jnp.moveaxis(size[:, None] * matrix.frame, -1, 0),
         bound=(matrix.curvature / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
         diagonal=scales.diagonal,
+        sticks=matrix.sticks.T,
     )
 
 
@@ -307,6 +310,8 @@ def _impulse_jvp(settings, primals, tangents):
     solution, out = _batched(settings, True)(*primals)
     f = _friction_scale(out.regular, friction)
     after = _apply(A, f) + out.diagonal[:, None, None] * _friction_scale(out.moved, friction) + v
+    # What is left of z where a contact sticks is an error, which a singular A would multiply by 1 / delta.
+    after = jnp.asarray(jnp.where((out.sticks & (friction > 0))[..., None], 0, after))
     # Where mu = 0 the tangent g is not determined by the problem, and z is the apex of its cone. For a growing mu,
     # friction opposes sliding, g = -f_n after_t / |after_t|, and z leaves the apex along its boundary: z_n = |z_t|,
     # with z_t = mu after_t.
