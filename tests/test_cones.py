@@ -138,10 +138,13 @@ def test_derivatives_agree_with_differences_and_between_modes(redundant):
 def test_where_a_contact_sticks_friction_changes_no_velocity():
     """Also where A is singular and the impulse of least norm is on the cone: its multiplier is next to zero there."""
     rng = np.random.default_rng(6)
-    null = rng.normal(size=(512, 3))
-    null /= np.linalg.norm(null, axis=1)[:, None]
-    A = 6 * (np.eye(3) - null[:, :, None] * null[:, None])
-    inside = np.concatenate([np.ones((512, 1)), 0.2 * rng.uniform(-1, 1, (512, 2))], axis=1)
+    turn = np.linalg.qr(rng.normal(size=(512, 3, 3)))[0]
+    values = np.concatenate([np.zeros((512, 1)), rng.uniform(1, 8, (512, 2))], axis=1)
+    A = np.einsum("bij,bj,bkj->bik", turn, values, turn)
+    A = (A + A.swapaxes(1, 2)) / 2
+    angle = rng.uniform(0, 2 * np.pi, 512)
+    share = np.where(np.arange(512) < 256, 0.2, 0.29)  # of an impulse that stops it, inside of the cone
+    inside = np.stack([np.ones(512), share * np.cos(angle), share * np.sin(angle)], axis=1)
     v = -np.einsum("bij,bj->bi", A, inside)[:, None]
     friction = np.full((512, 1), 0.3)
 
@@ -152,7 +155,7 @@ def test_where_a_contact_sticks_friction_changes_no_velocity():
     on_the_cone = np.linalg.norm(f[:, 0, 1:], axis=1) > 0.3 * (1 - 1e-6) * f[:, 0, 0]
     assert on_the_cone.sum() > 50
     assert np.abs(apply(A, f) + v).max() < 1e-7
-    assert np.abs(apply(A, slope)).max() < 1e-5
+    assert np.abs(apply(A, slope)).max() < 1e-4  # the root of the diagonal, 1e-9, times A
 
 
 def test_values_can_leave_their_ends():

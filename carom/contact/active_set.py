@@ -58,7 +58,7 @@ class ActiveSet(NamedTuple):
         s, z = frame.rotate(y), frame.rotate(z)
         held = z[:, :2] > s[:, :2]
         across = jnp.where(held[:, 0], _HELD, jnp.where(held[:, 1], z[:, 1] / jnp.maximum(s[:, 0], TINY), 0))
-        curvature = jnp.concatenate([jnp.where(held, _HELD, 0), jnp.minimum(across, _HELD)[:, None]], axis=1)
+        curvature = jnp.concatenate([jnp.where(held, _HELD, 0), jnp.clip(across, 0, _HELD)[:, None]], axis=1)
         pull = frame.restore(
             jnp.pad(jnp.where(held, z[:, :2] - _HELD * s[:, :2], 0), ((0, 0), (0, y.shape[1] - 2), (0, 0)))
         )
