@@ -174,8 +174,8 @@ def test_values_can_leave_their_ends():
 
 
 def test_padding_and_batches_without_contact_are_left_alone():
-    problems = generate(np.random.default_rng(1), "balls, mass ratio 1e4", 512, 2, 2, contacts=2)
-    A, v, friction, lower = problems.A, problems.v, problems.friction, problems.lower
+    problems = problems_of("balls, mass ratio 1e4", 1, 8, 2, 2, contacts=2)
+    A, v, friction, lower = (np.repeat(a, 64, axis=0) for a in problems)  # a batch that others have compiled for
     alone = SOLVE(*map(jnp.asarray, (A, v, friction, lower))).impulse
     wide = np.zeros((512, 8, 8))
     wide[:, :4, :4] = A
@@ -184,9 +184,7 @@ def test_padding_and_batches_without_contact_are_left_alone():
         return jnp.asarray(np.pad(x, ((0, 0), (0, 2)) + ((0, 0),) * (x.ndim - 2)))
 
     padded = SOLVE(jnp.asarray(wide), pad(v), pad(friction), pad(lower)).impulse
-    # What they do is the same. Impulses may differ where A is singular, within the tolerance of the conditions.
-    difference = apply(A, padded[:, :2] - alone)
-    assert np.all(np.abs(difference).max((1, 2)) <= 1e-8 * np.abs(v).max((1, 2)))
+    assert np.allclose(padded[:, :2], alone, atol=1e-9)
     assert not padded[:, 2:].any()
     nothing = SOLVE(jnp.zeros((512, 8, 8)), *(jnp.zeros((512, *s)) for s in ((4, 2), (4,), (4,))))
     assert not nothing.impulse.any()

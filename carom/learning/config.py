@@ -77,6 +77,11 @@ class LearnConfig:
             return self.chunk_length
         return 2 if self.model in BASELINES else 5
 
+    @property
+    def steps_per_epoch(self) -> int:
+        """Steps of the optimiser in an epoch."""
+        return -(-self.chunks_per_epoch // self.batch_size)
+
     def check(self) -> None:
         """Raise `CaromError` for a value that cannot be."""
         for name in ("epochs", "chunks_per_epoch", "batch_size", "patience", "width", "depth", "checkpoint_every"):

@@ -316,7 +316,7 @@ def learn(
     chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.states)
     smooth, impact = chunks.count()
     require(smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from.")
-    steps = -(-config.chunks_per_epoch // config.batch_size)  # in an epoch
+    steps = config.steps_per_epoch
     state = fresh_state(skeleton, config)
     restored = run.restore_checkpoint(state) if run is not None else None
     if run is not None and restored is not None:
@@ -400,7 +400,7 @@ def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, rate, stepper,
     unknowns, opt_state = state.unknowns, state.optimizer
     losses, overflow, skipped = [], state.overflow, state.skipped
     drawn = chunks.draw(rng, config.chunks_per_epoch, config.contact_share)
-    done = (epoch - 1) * -(-config.chunks_per_epoch // config.batch_size)
+    done = (epoch - 1) * config.steps_per_epoch
     for count, first in enumerate(range(0, config.chunks_per_epoch, config.batch_size)):
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
         data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
