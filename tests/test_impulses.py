@@ -1,12 +1,13 @@
 """Compression and restitution: recorded problems, Poisson's hypothesis, target velocities, bad input."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from systems import refused
 
 import carom
-from carom.contact.impulses import target_velocity
+from carom.contact.impulses import consistent_velocity, target_velocity, two_phases
 
 
 @pytest.mark.parametrize("task", ["bp5-e", "cp3", "gyro-e", "rope"])
@@ -37,6 +38,35 @@ def test_target_velocity_undoes_the_depth_where_nothing_hinders():
     assert np.allclose(free, [[0.25, 0], [0.5, 0]], atol=1e-8)
     held = jnp.zeros((1, 3, 2)).at[0, 0, 0].set(1.0)  # point 0 cannot move along its normal
     assert np.allclose(target_velocity(rows, jnp.array([0.02, 0.04]), held, time=0.08), [[0, 0], [0.5, 0]], atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_drift_off_the_joints_does_not_choose_the_impulse():
+    """A contact in 3D of a body on a ball joint: two free velocities for three rows, and velocities with some drift."""
+    rng = np.random.default_rng(0)
+    J = jnp.asarray(np.linalg.qr(rng.normal(size=(16, 3, 3)))[0][:, :, :2])
+    u = jnp.asarray(rng.normal(size=(16, 2)))
+    J = J.at[:, 0].multiply(-jnp.sign(J[:, :1] @ u[..., None])[..., 0])  # all approach
+    friction, restitution, target = jnp.full((16, 1), 0.3), jnp.full((16, 1), 0.8), jnp.zeros((16, 1, 3))
+    drift = jnp.asarray(rng.normal(size=(16, 1, 3)))
+
+    @jax.jit
+    def rebound(u, size, taken):
+        A = jnp.einsum("bri,bsi->brs", J, J)
+        off = size * drift
+        v = jnp.einsum("bri,bi->br", J, u)[:, None] + off
+        v = jnp.where(taken, jax.vmap(consistent_velocity)(v, off, A, friction), v)
+        compression, restored = two_phases(A, v, friction, restitution, target)
+        return jnp.stack([compression.impulse, restored.impulse])
+
+    exact = rebound(u, 0.0, False)
+    assert np.abs(rebound(u, 1e-5, False) - exact).max() > 0.1  # it would choose another
+    assert np.abs(rebound(u, 1e-5, True) - exact).max() < 1e-3
+    step, towards = 1e-5, jnp.asarray(rng.normal(size=(16, 2)))
+    slope = jax.jvp(lambda u: rebound(u, 1e-6, True), (u,), (towards,))[1]
+    difference = (rebound(u + step * towards, 0.0, False) - rebound(u - step * towards, 0.0, False)) / (2 * step)
+    assert np.abs(slope - difference).max() < 1e-3 * np.abs(difference).max()
 
 
 @pytest.mark.parametrize(

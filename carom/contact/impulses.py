@@ -271,6 +271,35 @@ def target_velocity(
     return target.reshape(k, d)
 
 
+def consistent_velocity(
+    velocity: Float[Array, "K d"],
+    drift: Float[Array, "K d"],
+    delassus: Float[Array, "r r"],
+    friction: Float[Array, " K"],
+) -> Float[Array, "K d"]:
+    """The contacts' velocities (m/s) less that part of their `drift` which no impulse can change.
+
+    `drift` is what a violation of the joints by the state gives to the contacts, `J_C M^-1 J_E^T G^-1 J_E v`: all that
+    can take `v_C` out of the range of `A`. Where `A` is singular, however little of it would choose among the many
+    impulses of one velocity change, against the one of least norm, and jump with the drift's sign. With
+    `Q = S A S`, `S = diag(1, mu, mu)` (friction's own scale: without friction tangents do not matter), the part is
+    `S^-1 (1 - Q Q^+) S drift`, taken as the limit of `delta (Q + delta)^-1`.
+    """
+    scale = jnp.concatenate([jnp.ones_like(velocity[:, :1]), jnp.broadcast_to(friction[:, None], drift[:, 1:].shape)], 1)
+    row = scale.reshape(-1)
+    matrix = row[:, None] * delassus * row
+    unreachable = _unreachable(matrix, row * drift.reshape(-1)).reshape(scale.shape)
+    return velocity - jnp.where(scale > 0, unreachable / jnp.where(scale > 0, scale, 1), 0)
+
+
+def _unreachable(matrix: Float[Array, "r r"], vector: Float[Array, " r"]) -> Float[Array, " r"]:
+    """The part of a vector that is orthogonal to the range of a matrix, to eight or so digits (four in single)."""
+    size = jnp.max(jnp.diag(matrix))
+    delta = jnp.where(size > 0, jnp.finfo(matrix.dtype).eps ** 0.6 * size, 1)
+    factor = jax.scipy.linalg.cho_factor(matrix + delta * jnp.eye(len(vector), dtype=matrix.dtype), lower=True)
+    return delta * jax.scipy.linalg.cho_solve(factor, vector)
+
+
 def _solve_regular(matrix, rhs, relative):
     size = jnp.max(jnp.diag(matrix))
     diagonal = jnp.where(size > 0, relative * size, 1)

@@ -115,7 +115,8 @@ def identify(
         dt=jnp.asarray(recording.dt),
         formulation=formulation,
         project=project,
-        compensation_steps=None if compensation_steps is None else jnp.asarray(compensation_steps, float),
+        compensation_steps=compensation_steps,
+        consistent=True,
     )
     unknowns = unknowns_of(system, learned)
     impacts = closing(recording, system)

@@ -326,7 +326,8 @@ def learn(
         dt=jnp.asarray(train.dt),
         formulation=FORMULATIONS[config.model],
         project=config.project,
-        compensation_steps=None if config.compensation_steps is None else jnp.asarray(config.compensation_steps, float),
+        compensation_steps=config.compensation_steps,
+        consistent=True,
     )
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
     speed = float(np.sqrt(np.mean(train.v[np.arange(train.v.shape[1]) < train.length[:, None]] ** 2)))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.candidates import Active
-from carom.contact.impulses import ContactModel, ContactState, Jump, target_velocity
+from carom.contact.impulses import ContactModel, ContactState, Jump, consistent_velocity, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
@@ -47,16 +47,26 @@ class Trajectory(eqx.Module):
     residual: Float[Array, "*b time"]
 
 
+def _as_steps(steps) -> Float[Array, ""] | None:
+    return None if steps is None else jnp.asarray(steps, float)
+
+
 class Stepper(eqx.Module):
-    """How to step: everything but the system and its state."""
+    """How to step: everything but the system and its state.
+
+    `consistent` matters where states are not projected: a violation of the joints then does not enter contacts whose
+    impulses are not unique (see `consistent_velocity`). The paper's simulator lets it, which gives jumps that hang on the
+    drift, and derivatives that training cannot use.
+    """
 
     dt: Float[Array, ""]
     formulation: Formulation = eqx.field(static=True, default="lagrangian")
     solver: diffrax.AbstractSolver = eqx.field(default_factory=RK4)
     project: bool = eqx.field(static=True, default=True)
-    compensation_steps: Float[Array, ""] | None = eqx.field(default_factory=lambda: jnp.asarray(COMPENSATION_STEPS))
+    compensation_steps: Float[Array, ""] | None = eqx.field(default=COMPENSATION_STEPS, converter=_as_steps)
     smoothing: float = eqx.field(static=True, default=0.0)
     contact: bool = eqx.field(static=True, default=True)
+    consistent: bool = eqx.field(static=True, default=False)
 
 
 class StepResult(eqx.Module):
@@ -115,11 +125,16 @@ def contact_jump(
     delassus = jnp.einsum("rid,sid->rs", rows, response)
     delassus = (delassus + delassus.T) / 2
     velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
+    friction = system.friction[active.property_index]
+    if saddle is not None and stepper.consistent and not stepper.project:
+        drift = jnp.einsum("rid,id->r", rows, v - saddle.project(v[None])[0]).reshape(k, d)
+        velocity = consistent_velocity(velocity, drift, delassus, friction)
     v_star = jnp.zeros_like(velocity)
     if stepper.compensation_steps is not None:
         joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
         depth = jnp.where(active.active, -active.gap, 0)
-        v_star = target_velocity(active.jacobian, depth, joints, time=stepper.dt * stepper.compensation_steps)
+        time = stepper.dt * stepper.compensation_steps.astype(stepper.dt.dtype)
+        v_star = target_velocity(active.jacobian, depth, joints, time=time)
     jump = system.contact_model(
         ContactState(
             x=x,
@@ -129,7 +144,7 @@ def contact_jump(
             delassus=delassus,
             velocity=velocity,
             target=v_star,
-            friction=system.friction[active.property_index],
+            friction=friction,
             restitution=system.restitution[active.property_index],
         ),
         smoothing=stepper.smoothing,
@@ -242,7 +257,7 @@ def simulate(
         formulation=formulation,
         solver=RK4() if solver is None else solver,
         project=project,
-        compensation_steps=None if compensation_steps is None else jnp.asarray(compensation_steps, x0.dtype),
+        compensation_steps=compensation_steps,
         smoothing=smoothing,
     )
     out = _simulate(system, x0, v0, stepper, int(steps), force)
