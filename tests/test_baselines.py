@@ -129,11 +129,7 @@ class Reversal(ContactModel):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "name"),
-    [
-        pytest.param(task, name, marks=pytest.mark.ci_budget if (task, name) == ("rope", "in-cp-sp") else ())
-        for task in ("cp3", "bp5-e", "gyro", "rope")
-        for name in BASELINES
-    ],
+    [(task, name) for task in ("cp3", "bp5-e", "gyro", "rope") for name in BASELINES],
 )
 def test_training_steps_are_finite_and_lower_the_loss(task, name):
     """On one batch of half smooth, half contact steps."""

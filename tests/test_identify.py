@@ -137,7 +137,6 @@ def test_intervals_cover_the_truth():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_masses_are_told_by_impacts_between_bodies_and_a_network_is_profiled_out():
     truth = carom.System(
         bodies=[carom.PointMass(1.0, 0.2), carom.PointMass(2.0, 0.2)],

@@ -31,11 +31,16 @@ class ConeSettings(NamedTuple):
     max_iterations: int = 40
 
     @classmethod
-    def for_dtype(cls, dtype, smoothing: float = 0.0) -> "ConeSettings":
-        """Settings that suit problems whose data were computed in `dtype`."""
+    def for_dtype(cls, dtype, smoothing: float = 0.0, *, work=None) -> "ConeSettings":
+        """Settings that suit problems whose data were computed in `dtype`, solved in the precision `work` (the same).
+
+        The diagonal makes up for rounding: of `A`, which is not quite positive semi-definite then, and of the
+        factorisation. More of it costs proximal rounds where a contact has little of the trace.
+        """
         if dtype == jnp.float64:
             return cls(tolerance=1e-8, target=1e-10, diagonal=1e-9, smoothing=smoothing)
-        return cls(tolerance=1e-4, target=1e-6, diagonal=1e-5, smoothing=smoothing)
+        diagonal = 1e-6 if work == jnp.float64 else 1e-5
+        return cls(tolerance=1e-4, target=1e-6, diagonal=diagonal, smoothing=smoothing)
 
 
 class Problem(NamedTuple):

@@ -169,9 +169,9 @@ def _wanted(settings: ConeSettings) -> float:
 # Round 0 goes only so far along the central path that the active set can be seen; the step onto it mostly is the end.
 # What is not solved then goes on along the path in round 1. Where that is not enough (data in single precision, whose
 # delta is large, with singular A or large impulses), the problem is solved again around the solution found: the
-# proximal-point method (Rockafellar, 1976), which needs two or three rounds.
+# proximal-point method (Rockafellar, 1976), which mostly needs two or three rounds.
 _COARSE = 1e-6
-_ROUNDS = 6
+_ROUNDS = 12
 
 
 def _start(problem: Problem) -> Iterate:
@@ -369,9 +369,9 @@ def solve_cone_problem(
     solvers*, 2010.
     """
     dtype = v.dtype
-    settings = ConeSettings.for_dtype(dtype, smoothing)
     widest = jnp.zeros((), float).dtype
     work = widest if widest.itemsize > dtype.itemsize else dtype
+    settings = ConeSettings.for_dtype(dtype, smoothing, work=work)
     lower = jnp.full_like(friction, -jnp.inf) if lower is None else lower
     reference = jnp.zeros_like(v) if reference is None else jax.lax.stop_gradient(reference)
     out = _impulse(*(x.astype(work) for x in (A, v, friction, lower, reference)), settings)

@@ -285,7 +285,9 @@ def consistent_velocity(
     `Q = S A S`, `S = diag(1, mu, mu)` (friction's own scale: without friction tangents do not matter), the part is
     `S^-1 (1 - Q Q^+) S drift`, taken as the limit of `delta (Q + delta)^-1`.
     """
-    scale = jnp.concatenate([jnp.ones_like(velocity[:, :1]), jnp.broadcast_to(friction[:, None], drift[:, 1:].shape)], 1)
+    scale = jnp.concatenate(
+        [jnp.ones_like(velocity[:, :1]), jnp.broadcast_to(friction[:, None], drift[:, 1:].shape)], 1
+    )
     row = scale.reshape(-1)
     matrix = row[:, None] * delassus * row
     unreachable = _unreachable(matrix, row * drift.reshape(-1)).reshape(scale.shape)

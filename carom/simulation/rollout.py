@@ -55,8 +55,8 @@ class Stepper(eqx.Module):
     """How to step: everything but the system and its state.
 
     `consistent` matters where states are not projected: a violation of the joints then does not enter contacts whose
-    impulses are not unique (see `consistent_velocity`). The paper's simulator lets it, which gives jumps that hang on the
-    drift, and derivatives that training cannot use.
+    impulses are not unique (see `consistent_velocity`). The paper's simulator lets it, which gives jumps that hang on
+    the drift, and derivatives that training cannot use.
     """
 
     dt: Float[Array, ""]
