@@ -32,7 +32,7 @@ class ConeSettings(NamedTuple):
 
     @classmethod
     def for_dtype(cls, dtype, smoothing: float = 0.0, *, work=None) -> "ConeSettings":
-        """Settings that suit problems whose data were computed in `dtype`, solved in the precision `work` (the same).
+        """Settings that suit problems whose data were computed in `dtype`, solved in `work` (by default the same).
 
         The diagonal makes up for rounding: of `A`, which is not quite positive semi-definite then, and of the
         factorisation. More of it costs proximal rounds where a contact has little of the trace.

@@ -262,8 +262,8 @@ def target_velocity(
     JE = jax.lax.stop_gradient(constraint_jacobian).reshape(constraint_jacobian.shape[0], JC.shape[1])
     depth = jax.lax.stop_gradient(depth)
     desired = jnp.zeros((k, d), JC.dtype).at[:, 0].set(depth / time).reshape(-1)
-    eps = jnp.finfo(JC.dtype).eps ** 0.6  # 4e-10 in double precision, 7e-5 in single
-    v = JC.T @ _solve_regular(JC @ JC.T, desired, eps)
+    gram = JC @ JC.T
+    v = JC.T @ _solve_regular(gram, desired, _vanishing(gram))
     closed = jnp.sum(jnp.any(JC.reshape(k, -1) != 0, axis=1))
     target = jnp.where(closed * d > JC.shape[1], JC @ v, desired)
     if JE.shape[0]:
@@ -290,21 +290,19 @@ def consistent_velocity(
     )
     row = scale.reshape(-1)
     matrix = row[:, None] * delassus * row
-    unreachable = _unreachable(matrix, row * drift.reshape(-1)).reshape(scale.shape)
+    delta = _vanishing(matrix)
+    unreachable = delta * _solve_regular(matrix, row * drift.reshape(-1), delta).reshape(scale.shape)
     return velocity - jnp.where(scale > 0, unreachable / jnp.where(scale > 0, scale, 1), 0)
 
 
-def _unreachable(matrix: Float[Array, "r r"], vector: Float[Array, " r"]) -> Float[Array, " r"]:
-    """The part of a vector that is orthogonal to the range of a matrix, to eight or so digits (four in single)."""
-    size = jnp.max(jnp.diag(matrix))
-    delta = jnp.where(size > 0, jnp.finfo(matrix.dtype).eps ** 0.6 * size, 1)
-    factor = jax.scipy.linalg.cho_factor(matrix + delta * jnp.eye(len(vector), dtype=matrix.dtype), lower=True)
-    return delta * jax.scipy.linalg.cho_solve(factor, vector)
+def _vanishing(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
+    """A diagonal in place of the limit of none: 4e-10 of the matrix in double precision, 7e-5 in single."""
+    return jnp.finfo(matrix.dtype).eps ** 0.6 * jnp.max(jnp.diag(matrix))
 
 
-def _solve_regular(matrix, rhs, relative):
-    size = jnp.max(jnp.diag(matrix))
-    diagonal = jnp.where(size > 0, relative * size, 1)
+def _solve_regular(matrix, rhs, diagonal):
+    """`(matrix + diagonal)^-1 rhs`; a matrix of zeros counts as the identity."""
+    diagonal = jnp.where(jnp.max(jnp.diag(matrix)) > 0, diagonal, 1)
     matrix = matrix + diagonal * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
 
