@@ -6,6 +6,7 @@ import pytest
 
 import carom
 from carom.learning.dataset import Dataset
+from carom.learning.evaluate import evaluate
 from carom.learning.models import mass_ratios
 from carom.learning.train import learn
 
@@ -51,3 +52,13 @@ def test_cp3_is_learned_from_recordings_carom_did_not_make(reference_dir):
     data = carom.load_recording(reference_dir / "reference" / "cp3_observed.npz", task="cp3")
     system, _ = learn(truth, Dataset.split(data), progress=False)
     check_learned(system, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_the_springs_of_a_rope_are_learned():
+    truth, dataset = full_dataset("rope")
+    system, _ = learn(truth, dataset, progress=False)
+    assert float(system.restitution[0]) < 5e-3
+    measures, _ = evaluate(system, carom.make_recording(truth, jax.random.key(2), 100), truth=truth)
+    assert measures["trajectory_error"] < 2e-3

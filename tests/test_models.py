@@ -1,5 +1,6 @@
 """Unknowns and learned potentials, and the file that holds a learned model."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,6 +76,46 @@ def test_model_file_round_trip(tmp_path, cp3, unknowns):
     assert all(np.array_equal(a, b) for a, b in zip(leaves, expected, strict=True) if hasattr(a, "dtype"))
     x = jnp.ones((3, 2))
     assert again.potential_energy(x) == system.potential_energy(x)
+
+
+def rope_potential():
+    """A potential of the task `rope`, scaled to recorded states, and the positions of these, (S, 10, 2)."""
+    rng = np.random.default_rng(0)
+    angle, length = rng.uniform(0, 3, (50, 10)), 0.05 + rng.normal(0, 0.003, (50, 10))
+    x = np.cumsum(length[..., None] * np.stack([np.sin(angle), -np.cos(angle)], axis=-1), axis=1)
+    recording = carom.Recording.of(x[None], rng.normal(size=x.shape)[None], dt=0.005)
+    rope = carom.task("rope")
+    return rope, NeuralPotential.of(rope, recording, key=jax.random.key(1), width=8, depth=2), jnp.asarray(x)
+
+
+def test_the_elastic_energy_of_segments_holds_springs():
+    rope, potential, x = rope_potential()
+    segments, springs = potential.segments, carom.Springs(range(10), 50.0, 0.05, anchor=(0.0, 0.0))
+    assert segments is not None
+    # 50 (mean + spread q - .05)^2, but for a constant.
+    linear = 100 * segments.spread * (segments.mean - 0.05)
+    square = jnp.full(10, 50 * segments.spread**2)
+    polynomial = jnp.stack([linear, square, 0 * square, 0 * square], axis=1) / segments.energy
+    segments = eqx.tree_at(lambda s: s.coefficients, segments, polynomial)
+    forces = jax.jit(jax.vmap(jax.grad(segments)))(x)
+    assert np.allclose(forces, jax.jit(jax.vmap(jax.grad(lambda x: springs(x, rope.mass_matrix()))))(x), atol=1e-10)
+
+
+def test_segments_without_recordings_or_limits(cp3):
+    assert NeuralPotential.of(cp3, None, key=jax.random.key(0), width=8, depth=2).segments is None
+    hung = NeuralPotential.of(carom.task("rope"), None, key=jax.random.key(0), width=8, depth=2)
+    assert np.isfinite(jax.jit(hung)(jnp.asarray(np.linspace(0.1, 1, 20).reshape(10, 2)), jnp.eye(10)))
+
+
+def test_a_model_with_segments_comes_back_from_its_file(tmp_path):
+    rope, potential, x = rope_potential()
+    potential = eqx.tree_at(lambda p: p.segments.coefficients, potential, jnp.ones((10, 4), jnp.float32))
+    system = Unknowns(None, None, None, potential).assemble(rope)
+    carom.save_model(tmp_path / "model.carom", system)
+    again = carom.load_model(tmp_path / "model.carom")
+    state = x[5]
+    assert again.potential_energy(state) == system.potential_energy(state)
+    assert again.potential_energy(state) != rope.potential_energy(state)
 
 
 def test_a_model_of_an_own_system_needs_its_skeleton(tmp_path):

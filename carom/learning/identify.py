@@ -12,10 +12,9 @@ Steps in which a gap, before or after, is closed or open by less than `doubt` st
 there errors decide which contacts act. What is left is minimised by the robust
 estimator of `robust.py`, from the learned values on, clustered by trajectory.
 
-A neural potential is profiled out: the weights of its output layer are estimated along with the physical parameters
+A neural potential is profiled out: the weights in which it is linear are estimated along with the physical parameters
 (along the principal directions of the forces they can make), so that standard errors hold what masses and forces can
-trade; its other layers are held. The values reported
-(`refined`) are this estimator's.
+trade; its other layers are held. The values reported (`refined`) are this estimator's.
 
 Friction is told by impacts that slide: a contact that sticks only says that its friction is at least the ratio of
 tangential to normal impulse that held it. Restitution is told by impacts whose rebound it decides: where the contact

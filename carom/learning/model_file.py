@@ -83,12 +83,13 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
         f"{skeleton.n_points} in {skeleton.dim}D. Give the skeleton it was learned with.",
     )
     if header["network"] is not None:
-        potential = NeuralPotential(
-            skeleton.n_points,
-            skeleton.dim,
-            width=header["network"]["width"],
-            depth=header["network"]["depth"],
-            dtype=jnp.dtype(header["network"]["dtype"]),
+        network = header["network"]
+        potential = NeuralPotential.of(
+            skeleton,
+            None,
+            width=network["width"],
+            depth=network["depth"],
+            dtype=jnp.dtype(network["dtype"]),
             key=jax.random.key(0),
         )
         skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)

@@ -8,20 +8,79 @@ import optax.projections
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from carom.contact.impulses import ContactModel
+from carom.contact.limits import StretchLimit
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Potential
+from carom.simulation.files import Recording
 from carom.system import StepModel, System
+
+
+class SegmentEnergy(eqx.Module):
+    """Elastic energy of the segments of chains that may stretch: for each a polynomial of its length, to be learned,
+
+        V = energy sum_k c_k q^k,   k = 1, ..., 4,   q = (length - mean) / spread.
+
+    A segment stretches by little of its length, so that the energy's curvature along it is a thousand times that along
+    other directions. A network of the points' coordinates learns such a curvature last, if at all.
+    """
+
+    ends: tuple[tuple[int, int], ...] = eqx.field(static=True)  # points; -1: the anchor
+    coefficients: Float[Array, "s 4"]
+    # Of the data and the geometry: not learned.
+    anchors: Float[Array, "s 2"]  # m
+    mean: Float[Array, " s"]  # m
+    spread: Float[Array, ""]  # m
+    energy: Float[Array, ""]  # J
+
+    @classmethod
+    def of(cls, skeleton: System, recording: Recording | None, dtype) -> "SegmentEnergy | None":
+        """Of all segments with a `StretchLimit`, scaled to the recorded motion; None if there are none."""
+        ends, anchors = [], []
+        for contact in skeleton.contacts:
+            if isinstance(contact, StretchLimit):
+                center, anchor = skeleton.table.center, contact.chain.anchor
+                ends += [tuple(-1 if b < 0 else center[b] for b in run) for run in contact.chain.windows(2)]
+                anchors += [np.zeros(2) if anchor is None else np.asarray(anchor)] * len(contact.property_index)
+        if not ends:
+            return None
+        floats, count = skeleton.friction.dtype, len(ends)
+        unit, zero = jnp.ones((), floats), jnp.zeros(count, floats)
+        new = cls(tuple(ends), jnp.zeros((count, 4), dtype), jnp.asarray(np.array(anchors), floats), zero, unit, unit)
+        if recording is None:
+            return new
+        valid = np.arange(recording.x.shape[1]) < recording.length[:, None]
+        length = np.asarray(jax.vmap(new.lengths)(jnp.asarray(recording.x[valid], floats)))
+        # A thousandth of the length where nothing stretches; mean kinetic energy of a point.
+        spread = max(float(length.std(axis=0).max()), 1e-3 * float(length.mean()))
+        energy = 0.5 * float(skeleton.masses[0]) * float(np.mean(np.sum(recording.v[valid] ** 2, axis=-1)))
+        values = length.mean(axis=0), spread, energy if energy > 0 else 1.0
+        return eqx.tree_at(lambda s: (s.mean, s.spread, s.energy), new, tuple(jnp.asarray(a, floats) for a in values))
+
+    def lengths(self, x: Float[Array, "n 2"]) -> Float[Array, " s"]:
+        """Lengths of the segments (m)."""
+        first, second = np.array(self.ends).T
+        start = jnp.where((first < 0)[:, None], self.anchors.astype(x.dtype), x[first])
+        return jnp.linalg.norm(x[second] - start, axis=1)
+
+    def __call__(self, x: Float[Array, "n 2"]) -> Float[Array, ""]:
+        mean, spread, energy = (a.astype(x.dtype) for a in jax.lax.stop_gradient((self.mean, self.spread, self.energy)))
+        q = ((self.lengths(x) - mean) / spread).astype(self.coefficients.dtype)
+        powers = jnp.stack([q, q**2, q**3, q**4], axis=1)
+        return energy * jnp.sum(self.coefficients * powers).astype(x.dtype)
 
 
 class NeuralPotential(Potential):
     """A potential energy learned as a multi-layer perceptron of all points, with softplus units.
 
+    Where chains may stretch, the elastic energy of their segments is added: see `SegmentEnergy`.
+
     **Arguments:** `n_points`, `dim`: of the system; `width`, `depth`: units of a hidden layer, number of hidden layers;
     `key`: random key of the initial weights; `dtype`: of the weights and of the evaluation (single precision by
-    default, also inside of simulations in double).
+    default, also inside of simulations in double); `segments`: elastic energy of segments, or `None`.
     """
 
     network: eqx.nn.MLP
+    segments: SegmentEnergy | None
 
     def __init__(
         self,
@@ -32,14 +91,38 @@ class NeuralPotential(Potential):
         depth: int = 3,
         key: PRNGKeyArray,
         dtype=jnp.float32,
+        segments: SegmentEnergy | None = None,
     ):
         self.network = eqx.nn.MLP(
             n_points * dim, "scalar", width, depth, activation=jax.nn.softplus, key=key, dtype=dtype
         )
+        self.segments = segments
+
+    @classmethod
+    def of(
+        cls, skeleton: System, recording: Recording | None, *, key: PRNGKeyArray, dtype=jnp.float32, **sizes: int
+    ) -> "NeuralPotential":
+        """An untrained potential of a system, scaled to `recording` where there is one; `sizes`: width and depth."""
+        segments = SegmentEnergy.of(skeleton, recording, dtype)
+        return cls(skeleton.n_points, skeleton.dim, key=key, dtype=dtype, segments=segments, **sizes)
 
     def __call__(self, x, mass_matrix):
         dtype = self.network.layers[0].weight.dtype
-        return self.network(x.reshape(-1).astype(dtype)).astype(x.dtype)
+        value = self.network(x.reshape(-1).astype(dtype)).astype(x.dtype)
+        return value if self.segments is None else value + self.segments(x)
+
+    def learned(self) -> tuple[eqx.nn.MLP | Float[Array, "s 4"], ...]:
+        """The parts that are learned."""
+        return (self.network,) if self.segments is None else (self.network, self.segments.coefficients)
+
+    def linear_weights(self) -> tuple[Float[Array, "..."], ...]:
+        """The parameters in which the potential is linear: the output layer's weights, and those of the segments."""
+        output = self.network.layers[-1].weight
+        return (output,) if self.segments is None else (output, self.segments.coefficients)
+
+    def with_linear_weights(self, weights: tuple[Float[Array, "..."], ...]) -> "NeuralPotential":
+        """The potential with other values of `linear_weights`."""
+        return eqx.tree_at(lambda p: p.linear_weights(), self, weights)
 
 
 class Unknowns(eqx.Module):

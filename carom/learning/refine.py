@@ -100,7 +100,7 @@ class Problem:
 
 
 def principal_forces(unknowns: Unknowns, recording: Recording, steps, *, most: int = 100, smallest: float = 1e-5):
-    """The principal directions (W, F) of the forces that the network's output layer can make, None without a network.
+    """The principal directions (W, F) of the forces of a network's linear weights; None without a network.
 
     At most `most`, with a root mean square force of at least `smallest` of the largest one's.
     """
@@ -177,11 +177,11 @@ def _settled(solution: Solution, count: int) -> bool:
 
 
 def _ridge(problem: Problem) -> float:
-    """Precision of the output layer's weights: they may change by as much as they are."""
+    """Precision of the weights that are profiled out: they may change by as much as they are."""
     if problem.unknowns.potential is None:
         return 0.0
-    weight = np.asarray(problem.unknowns.potential.network.layers[-1].weight, float)
-    return float(1 / np.mean(weight**2))
+    weights = [np.asarray(w, float).ravel() for w in problem.unknowns.potential.linear_weights()]
+    return float(1 / np.mean(np.concatenate(weights) ** 2))
 
 
 def _vector(unknowns: Unknowns) -> Float[np.ndarray, " p"]:

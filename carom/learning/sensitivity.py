@@ -47,7 +47,7 @@ def step_sensitivity(
     """Of the step from the recorded state `start` to `end`, each `(x, v)`.
 
     The Jacobian has a column for the properties of the closed contacts only, so that its cost does not grow with the
-    number of properties. `features` are directions in the weights of the network's output layer, see `force_features`.
+    number of properties. `features` are directions in the network's linear weights, see `force_features`.
     """
     x, v = start
     system = unknowns.assemble(skeleton)
@@ -113,18 +113,20 @@ def _nudged(unknowns: Unknowns, nudge, column, skeleton: System) -> System:
 def force_features(
     potential: NeuralPotential | None, x: Float[Array, "n d"], directions: Float[Array, "W F"] | None = None
 ) -> Float[Array, "nd F"]:
-    """Generalised force (N) of a unit change of the weights of the network's output layer, along `directions`.
+    """Generalised force (N) of a unit change of the weights in which the potential is linear, along `directions`.
 
-    The output layer's part of the potential is linear in its weights, so that these are all the forces it can add.
+    These are all the forces that the output layer of the network and the energy of the segments can add.
     """
     if potential is None:
         return jnp.zeros((x.size, 0), x.dtype)
-    weight = potential.network.layers[-1].weight
+    weights = potential.linear_weights()
 
-    def value(x, weight):
-        changed = eqx.tree_at(lambda p: p.network.layers[-1].weight, potential, weight)
-        return changed(x, jnp.zeros((0, 0), x.dtype))
+    def value(x, weights):
+        return potential.with_linear_weights(weights)(x, jnp.zeros((0, 0), x.dtype))
 
-    force = -jax.jacfwd(lambda x: jax.grad(value, argnums=1)(x, weight).reshape(-1))(x).reshape(-1, x.size).T
+    def slope(x):
+        return jnp.concatenate([g.reshape(-1) for g in jax.grad(value, argnums=1)(x, weights)])
+
+    force = -jax.jacfwd(slope)(x).reshape(-1, x.size).T
     force = force.astype(x.dtype)
     return force if directions is None else force @ directions

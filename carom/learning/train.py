@@ -57,8 +57,8 @@ class TrainState(eqx.Module):
     overflow: Int[Array, ""]
 
 
-def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
-    """Starting values: equal masses, the configured friction and restitution, a random network.
+def initial_unknowns(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> Unknowns:
+    """Starting values: equal masses, the configured friction and restitution, a random network scaled to `recording`.
 
     An epsilon that is learned starts from the skeleton's, whose contact model must be CMr.
     A potential of the skeleton that is itself a `NeuralPotential` is taken as the starting point.
@@ -74,9 +74,8 @@ def initial_unknowns(skeleton: System, config: LearnConfig) -> Unknowns:
     if isinstance(skeleton.potential, NeuralPotential):
         potential = skeleton.potential
     else:
-        potential = NeuralPotential(
-            skeleton.n_points, skeleton.dim, width=config.width, depth=config.depth, key=jax.random.key(config.seed)
-        )
+        key = jax.random.key(config.seed)
+        potential = NeuralPotential.of(skeleton, recording, key=key, width=config.width, depth=config.depth)
     return Unknowns(
         log_mass_ratio=chosen("mass", jnp.zeros(len(skeleton.bodies) - 1, floats)),
         friction=chosen("friction", jnp.full(count, config.initial_friction, floats)),
@@ -132,7 +131,8 @@ def make_optimizer(rates: Rates) -> optax.GradientTransformation:
 
 def _is_network(unknowns: Unknowns):
     def networks(u):
-        return u.potential, u.contact_model, u.step_model
+        potential = () if u.potential is None else u.potential.learned()
+        return *potential, u.contact_model, u.step_model
 
     return eqx.tree_at(
         networks,
@@ -225,9 +225,9 @@ def validate(unknowns, skeleton, x, v, stepper):
     return jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v))
 
 
-def fresh_state(skeleton: System, config: LearnConfig) -> TrainState:
-    """The state before the first epoch."""
-    unknowns = initial_unknowns(skeleton, config)
+def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> TrainState:
+    """The state before the first epoch; a network is scaled to `recording`."""
+    unknowns = initial_unknowns(skeleton, config, recording)
     with jax.numpy_dtype_promotion("standard"):
         opt_state = make_optimizer(Rates.of(config, 0)).init(eqx.filter(unknowns, eqx.is_inexact_array))
     zero = jnp.asarray(0)
@@ -317,7 +317,7 @@ def learn(
     smooth, impact = chunks.count()
     require(smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from.")
     steps = config.steps_per_epoch
-    state = fresh_state(skeleton, config)
+    state = fresh_state(skeleton, config, train)
     restored = run.restore_checkpoint(state) if run is not None else None
     if run is not None and restored is not None:
         state = restored
