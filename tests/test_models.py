@@ -1,5 +1,7 @@
 """Unknowns and learned potentials, and the file that holds a learned model."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 import carom
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
+from carom.learning.train import Rates, make_optimizer
 
 
 @pytest.fixture(scope="module")
@@ -97,14 +100,14 @@ def test_the_elastic_energy_of_segments_holds_springs():
     square = jnp.full(10, 50 * segments.spread**2)
     polynomial = jnp.stack([linear, square, 0 * square, 0 * square], axis=1) / segments.energy
     segments = eqx.tree_at(lambda s: s.coefficients, segments, polynomial)
-    forces = jax.jit(jax.vmap(jax.grad(segments)))(x)
+    forces = jax.jit(jax.vmap(jax.grad(lambda x: segments(x))))(x)
     assert np.allclose(forces, jax.jit(jax.vmap(jax.grad(lambda x: springs(x, rope.mass_matrix()))))(x), atol=1e-10)
 
 
 def test_segments_without_recordings_or_limits(cp3):
     assert NeuralPotential.of(cp3, None, key=jax.random.key(0), width=8, depth=2).segments is None
     hung = NeuralPotential.of(carom.task("rope"), None, key=jax.random.key(0), width=8, depth=2)
-    assert np.isfinite(jax.jit(hung)(jnp.asarray(np.linspace(0.1, 1, 20).reshape(10, 2)), jnp.eye(10)))
+    assert np.isfinite(eqx.filter_jit(hung)(jnp.asarray(np.linspace(0.1, 1, 20).reshape(10, 2)), jnp.eye(10)))
 
 
 def test_a_model_with_segments_comes_back_from_its_file(tmp_path):
@@ -151,3 +154,15 @@ def test_a_model_of_another_system_is_refused(tmp_path, cp3, unknowns):
     carom.save_model(tmp_path / "model.carom", unknowns.assemble(cp3))
     with pytest.raises(carom.CaromError, match="3 points in 2D"):
         load_model_into(tmp_path / "model.carom", carom.task("bp5"))
+
+
+def test_weights_decay_and_scales_do_not():
+    _, potential, _ = rope_potential()
+    unknowns = eqx.filter(Unknowns(None, None, None, potential), eqx.is_inexact_array)
+    with jax.numpy_dtype_promotion("standard"):
+        optimizer = make_optimizer(Rates.of(carom.LearnConfig(), 1e-3))
+        zero = jax.tree.map(jnp.zeros_like, unknowns)
+        change: Any = optimizer.update(zero, optimizer.init(unknowns), unknowns)[0]
+    assert all(np.any(layer.weight) for layer in change.potential.network.layers)
+    scales = eqx.tree_at(lambda s: s.coefficients, change.potential.segments, jnp.zeros(1))
+    assert not any(np.any(a) for a in jax.tree.leaves(scales))

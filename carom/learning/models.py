@@ -1,5 +1,7 @@
 """What is learned: a neural potential, masses and contact properties, assembled into a System (CLNN and CHNN)."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -111,16 +113,15 @@ class NeuralPotential(Potential):
         value = self.network(x.reshape(-1).astype(dtype)).astype(x.dtype)
         return value if self.segments is None else value + self.segments(x)
 
-    def learned(self) -> tuple[eqx.nn.MLP | Float[Array, "s 4"], ...]:
-        """The parts that are learned."""
-        return (self.network,) if self.segments is None else (self.network, self.segments.coefficients)
+    def linear_weights(self) -> tuple[Any, ...]:
+        """The parameters in which the potential is linear: the output layer's weights, and those of the segments.
 
-    def linear_weights(self) -> tuple[Float[Array, "..."], ...]:
-        """The parameters in which the potential is linear: the output layer's weights, and those of the segments."""
+        Arrays, or what `equinox.tree_at` puts in their place.
+        """
         output = self.network.layers[-1].weight
         return (output,) if self.segments is None else (output, self.segments.coefficients)
 
-    def with_linear_weights(self, weights: tuple[Float[Array, "..."], ...]) -> "NeuralPotential":
+    def with_linear_weights(self, weights: tuple[Any, ...]) -> "NeuralPotential":
         """The potential with other values of `linear_weights`."""
         return eqx.tree_at(lambda p: p.linear_weights(), self, weights)
 

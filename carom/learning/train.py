@@ -130,16 +130,14 @@ def make_optimizer(rates: Rates) -> optax.GradientTransformation:
 
 
 def _is_network(unknowns: Unknowns):
-    def networks(u):
-        potential = () if u.potential is None else u.potential.learned()
-        return *potential, u.contact_model, u.step_model
+    """Which arrays are weights of a network, or the coefficients beside it."""
 
-    return eqx.tree_at(
-        networks,
-        jax.tree.map(lambda _: False, unknowns),
-        jax.tree.map(lambda _: True, networks(unknowns)),
-        is_leaf=lambda x: x is None,
-    )
+    def flag(path, _):
+        names = [getattr(key, "name", "") for key in path]
+        fixed = "segments" in names and names[-1] != "coefficients"  # the scales of a `SegmentEnergy`
+        return names[0] in ("potential", "contact_model", "step_model") and not fixed
+
+    return jax.tree_util.tree_map_with_path(flag, unknowns)
 
 
 def _is_property(unknowns: Unknowns):
