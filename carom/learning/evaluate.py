@@ -52,12 +52,11 @@ def state_errors(
         return np.concatenate([np.asarray(a).reshape(*np.shape(a)[:2], -1) for a in (x, v)], axis=-1)
 
     true, guess = flat(recording.x, recording.v), flat(predicted.x, predicted.v)
-    valid = np.arange(true.shape[1]) < recording.length[:, None]
-    true = np.where(valid[..., None], true, np.nan)
+    true = np.where(recording.valid[..., None], true, np.nan)
     distance = np.linalg.norm(true - guess, axis=-1)
     size = np.linalg.norm(true, axis=-1)
     bounded = distance / np.sqrt(size**2 + np.linalg.norm(guess, axis=-1) ** 2)
-    lost = valid & ~np.isfinite(guess).all(axis=-1)
+    lost = recording.valid & ~np.isfinite(guess).all(axis=-1)
     return np.where(lost, np.inf, distance / size), np.where(lost, 1.0, bounded)
 
 

@@ -50,11 +50,11 @@ class SegmentEnergy(eqx.Module):
         new = cls(tuple(ends), jnp.zeros((count, 4), dtype), jnp.asarray(np.array(anchors), floats), zero, unit, unit)
         if recording is None:
             return new
-        valid = np.arange(recording.x.shape[1]) < recording.length[:, None]
-        length = np.asarray(jax.vmap(new.lengths)(jnp.asarray(recording.x[valid], floats)))
-        # A thousandth of the length where nothing stretches; mean kinetic energy of a point.
+        length = np.asarray(jax.vmap(new.lengths)(jnp.asarray(recording.x[recording.valid], floats)))
+        # At least a thousandth of the length, where nothing stretches.
         spread = max(float(length.std(axis=0).max()), 1e-3 * float(length.mean()))
-        energy = 0.5 * float(skeleton.masses[0]) * float(np.mean(np.sum(recording.v[valid] ** 2, axis=-1)))
+        # The mean kinetic energy of a point.
+        energy = 0.5 * float(skeleton.masses[0]) * float(np.mean(np.sum(recording.v[recording.valid] ** 2, axis=-1)))
         values = length.mean(axis=0), spread, energy if energy > 0 else 1.0
         return eqx.tree_at(lambda s: (s.mean, s.spread, s.energy), new, tuple(jnp.asarray(a, floats) for a in values))
 

@@ -248,7 +248,7 @@ def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> in
     )
     most = 0
     for name, part in (("train", dataset.train), ("val", dataset.val)):
-        valid = np.arange(part.x.shape[1]) < part.length[:, None]
+        valid = part.valid
         drift = np.abs(np.asarray(skeleton.constraints(jnp.asarray(part.x[valid]))))
         limit = 5e-2
         require(
@@ -328,7 +328,7 @@ def learn(
         consistent=True,
     )
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
-    speed = float(np.sqrt(np.mean(train.v[np.arange(train.v.shape[1]) < train.length[:, None]] ** 2)))
+    speed = float(np.sqrt(np.mean(train.v[train.valid] ** 2)))
 
     def width(epoch: int) -> Float[Array, ""]:
         done = (epoch - 1) / config.epochs

@@ -60,6 +60,11 @@ class Recording(eqx.Module):
     source: str = eqx.field(static=True)
     carom_version: str = eqx.field(static=True)
 
+    @property
+    def valid(self) -> Bool[np.ndarray, "N T"]:
+        """Which samples are not padding."""
+        return np.arange(self.x.shape[1]) < self.length[:, None]
+
     @classmethod
     def of(
         cls,
