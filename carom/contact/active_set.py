@@ -139,8 +139,13 @@ _UNROLLED = 8
 
 
 def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
-    """An impulse near the solution, by projected Gauss-Seidel in the metric of `(f_n, f_t)`."""
+    """An impulse near the solution, by projected Gauss-Seidel in the metric of `(f_n, f_t)`.
+
+    In single precision, which is enough to see the active set.
+    """
     k, d, batch = problem.q.shape
+    dtype = problem.q.dtype
+    problem, mu = jax.tree.map(lambda x: x.astype(jnp.float32), (problem, mu))
     index = jnp.arange(k)
     rows = problem.Q.reshape(k, d, k * d, batch)
     metric = jnp.concatenate([jnp.ones_like(mu)[:, None], jnp.broadcast_to(mu[:, None], (k, d - 1, batch))], axis=1)
@@ -162,7 +167,7 @@ def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
     def body(_, y: Array) -> Array:
         return jax.lax.fori_loop(0, k, contact, y, unroll=k <= _UNROLLED)
 
-    return jax.lax.fori_loop(0, _SWEEPS, body, jnp.zeros_like(problem.q))
+    return jax.lax.fori_loop(0, _SWEEPS, body, jnp.zeros_like(problem.q)).astype(dtype)
 
 
 class NewtonStep(NamedTuple):
@@ -179,14 +184,15 @@ def newton_steps(
 ) -> NewtonStep:
     """Some Newton steps from `y`, each onto the active set seen at its start. For `apex` see `ActiveSet.at`."""
 
-    def body(count, last: NewtonStep) -> NewtonStep:
-        y = last.regular
-        active = ActiveSet.at(problem, y, apex & (count == _NEWTON_STEPS - 1))
+    def step(y: Array, apex: Array) -> NewtonStep:
+        active = ActiveSet.at(problem, y, apex)
         sides = jnp.stack([active.rhs, regularization * y], axis=2)
         matrix = NewtonMatrix(problem.Q, active.scaling, active.curvature, sides)
         regular = y + matrix.solution[:, :, 0]
         return NewtonStep(regular, regular + matrix.solution[:, :, 1], active.margin, matrix.factored())
 
-    k, d, batch = y.shape
-    start = NewtonStep(y, y, y[0, 0], Factored.nothing(k, d, batch, y.dtype))
-    return jax.lax.fori_loop(0, _NEWTON_STEPS, body, start)
+    def body(count, last: NewtonStep) -> NewtonStep:
+        return step(last.regular, apex & (count == _NEWTON_STEPS - 1))
+
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, y, apex))
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, body, nothing._replace(regular=y))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from carom.contact.linalg import Cholesky
+from carom.contact.linalg import Cholesky, triangle_of
 
 TINY = 1e-30
 
@@ -141,23 +141,21 @@ def add_normal(x, normal):
     return x.at[:, 0].add(normal)
 
 
-# The eigenvectors p, m and the one across, as columns along (normal, u, across u).
-_TURN = np.array([[0.5**0.5, 0.5**0.5, 0.0], [0.5**0.5, -(0.5**0.5), 0.0], [0.0, 0.0, 1.0]])
+# The eigenvectors p, m and the one across, as columns along (normal, u, across u), times their lengths.
+_TURN = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+_LENGTH = np.array([2**0.5, 2**0.5, 1.0])
 
 
 class Factored(NamedTuple):
     """A factored `NewtonMatrix`, as it is kept for the derivative: its inverse is `frame L^-T L^-1 frame^T`."""
 
-    triangle: Float[Array, "B n n"]  # L
+    parts: tuple[Array, ...]  # of L
     frame: Float[Array, "K d d B"]
     curvature: Float[Array, "K B"]  # D, of the bounds
     sticks: Bool[Array, "K B"]  # contacts inside of their cone: W^-2 = 0
 
-    @classmethod
-    def nothing(cls, k: int, d: int, batch: int, dtype) -> "Factored":
-        n = k * d
-        zeros = jnp.zeros((k, d, d, batch), dtype)
-        return cls(jnp.zeros((batch, n, n), dtype), zeros, zeros[:, 0, 0], jnp.zeros((k, batch), bool))
+    def triangle(self) -> Float[Array, "B n n"]:
+        return triangle_of(self.parts)
 
 
 class NewtonMatrix:
@@ -178,18 +176,20 @@ class NewtonMatrix:
     ):
         k, d, batch = scaling.inverse.shape
         rotated = (jnp.max(scaling.inverse, axis=1) ** 2 > curvature)[:, None, None]
-        turn = _TURN[:d, :d, None].astype(Q.dtype)
+        turn, length = (x.astype(Q.dtype) for x in (_TURN[:d, :d, None], _LENGTH[:d, None]))
         eye = jnp.eye(d, dtype=Q.dtype)[..., None]
         plain = scaling.along_tangent()
         self.curvature = curvature
         self.sticks = jnp.all(scaling.inverse == 0, axis=1)
-        self.frame = jnp.where(rotated, jnp.sum(plain[:, :, :, None] * turn, axis=2), plain)
+        # The division keeps XLA from forming the frame again for every entry that it turns.
+        turned = jnp.where(rotated, jnp.sum(plain[:, :, :, None] * turn, axis=2), plain)
+        self.frame = turned / jnp.where(rotated, length, 1)
         H = self.rotate(Q.reshape(k, d, k * d, batch)).reshape(k * d, k * d, batch).swapaxes(0, 1)
         H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
         # The contact's own block is W^-2 + D e_n e_n^T = (sum_j a_j r_j r_j^T) + D e_n e_n^T in either frame, with r_j
         # the eigenvectors and a_j the eigenvalues.
-        eigenvectors = jnp.where(rotated, eye, turn)  # [:, :, j] = r_j
-        normal = jnp.where(rotated, turn, eye)[:, 0]
+        eigenvectors = jnp.where(rotated, eye, turn / length)  # [:, :, j] = r_j
+        normal = jnp.where(rotated, turn / length, eye)[:, 0]
         block = jnp.sum((scaling.inverse**2)[:, None, None] * eigenvectors[:, :, None] * eigenvectors[:, None], axis=3)
         block = block + curvature[:, None, None] * normal[:, :, None] * normal[:, None, :]
         index = jnp.arange(k)
@@ -202,7 +202,7 @@ class NewtonMatrix:
             self.solution = self.restore(self.factor.solution.reshape(rhs.shape))
 
     def factored(self) -> Factored:
-        return Factored(self.factor.triangle(), self.frame, self.curvature, self.sticks)
+        return Factored(self.factor.parts, self.frame, self.curvature, self.sticks)
 
     def rotate(self, x: Float[Array, "K d *m B"]) -> Float[Array, "K d *m B"]:
         """Components along the frame's axes."""

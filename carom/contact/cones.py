@@ -126,7 +126,7 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
     return solution, _Sensitivity(
         regular=jnp.moveaxis(size * scales.unit * out.regular, -1, 0),
         moved=jnp.moveaxis(size * scales.unit * (out.regular - out.center), -1, 0),
-        triangle=matrix.triangle,
+        triangle=matrix.triangle(),
         frame=jnp.moveaxis(size[:, None] * matrix.frame, -1, 0),
         bound=(matrix.curvature / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
         diagonal=scales.diagonal,
@@ -231,14 +231,18 @@ def _proximal_point(problem: Problem, scales: Scales, settings: ConeSettings) ->
 # --- Batches ----------------------------------------------------------------------------------------------------
 
 BLOCK = {6: 128, 24: 64}
-"""Problems solved together, by the most rows that a problem has (more rows: 32).
+"""Problems solved together the short way, by the most rows that a problem has (more rows: 32).
 
 Enough to fill vector units; few enough for their matrices to stay in cache, and for the slowest not to hold up many.
 """
 
+LONG_BLOCK = {6: 64}
+"""The same for the long way (more rows: 16), which few problems take and the slowest of a block holds up more."""
 
-def _block_size(rows: int) -> int:
-    return next((size for most, size in BLOCK.items() if rows <= most), 32)
+
+def _block_size(rows: int, short: bool) -> int:
+    sizes, rest = (BLOCK, 32) if short else (LONG_BLOCK, 16)
+    return next((size for most, size in sizes.items() if rows <= most), rest)
 
 
 def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensitivity: bool):
@@ -265,7 +269,7 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
         arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
         missing = chosen & ~(out[0].residual <= _wanted(settings))
         solve = functools.partial(_solve_block, settings=settings, sensitivity=sensitivity, short=short)
-        out = solve_chosen(solve, arrays, missing, _block_size(m), out)
+        out = solve_chosen(solve, arrays, missing, _block_size(m, short), out)
     return out
 
 

@@ -6,6 +6,8 @@ beats LAPACK, which is called once a matrix, four to twenty times on a CPU (`ben
 makes no library calls that could block one another. Larger systems go to LAPACK.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -42,22 +44,29 @@ class Cholesky:
             if rhs is not None:
                 self.solution = self.solve(rhs)
 
-    def triangle(self) -> Float[Array, "B n n"]:
-        """`L`, with the batch first."""
-        return jnp.moveaxis(self._rows(), -1, 0) if self.unrolled else self.lower
-
-    def _rows(self) -> Float[Array, "n n B"]:
-        return jnp.stack([jnp.pad(c, ((j, 0), (0, 0))) for j, c in enumerate(self.columns)], axis=1)
+    @property
+    def parts(self) -> tuple[Array, ...]:
+        """`L` as it is at hand; see `triangle_of`."""
+        return tuple(self.columns) if self.unrolled else (self.lower,)
 
     def solve(self, rhs: Float[Array, "n *m B"]) -> Float[Array, "n *m B"]:
         """Solve `H x = rhs` for one or several right-hand sides."""
         if self.unrolled and self.size <= UNROLL_SOLVE_LIMIT:
             return _solve_unrolled(self.columns, rhs)
         if self.unrolled:
-            return _solve_by_rows(self._rows(), rhs)
+            return _solve_by_rows(_rows(self.columns), rhs)
         flat = jnp.moveaxis(rhs.reshape(self.size, -1, rhs.shape[-1]), -1, 0)
         x = jax.scipy.linalg.cho_solve((self.lower, True), flat)
         return jnp.moveaxis(x, 0, -1).reshape(rhs.shape)
+
+
+def triangle_of(parts: tuple[Array, ...]) -> Float[Array, "B n n"]:
+    """`L`, with the batch first, of a `Cholesky`'s `parts`: its columns from the diagonal down, or `L` itself."""
+    return parts[0] if parts[0].ndim == 3 else jnp.moveaxis(_rows(parts), -1, 0)
+
+
+def _rows(columns: Sequence[Float[Array, "_ B"]]) -> Float[Array, "n n B"]:
+    return jnp.stack([jnp.pad(c, ((j, 0), (0, 0))) for j, c in enumerate(columns)], axis=1)
 
 
 def _factor_unrolled(matrix: Float[Array, "all_rows n B"]) -> list[Float[Array, "_ B"]]:
