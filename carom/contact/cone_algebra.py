@@ -177,7 +177,6 @@ class NewtonMatrix:
         k, d, batch = scaling.inverse.shape
         rotated = (jnp.max(scaling.inverse, axis=1) ** 2 > curvature)[:, None, None]
         turn, length = (x.astype(Q.dtype) for x in (_TURN[:d, :d, None], _LENGTH[:d, None]))
-        eye = jnp.eye(d, dtype=Q.dtype)[..., None]
         plain = scaling.along_tangent()
         self.curvature = curvature
         self.sticks = jnp.all(scaling.inverse == 0, axis=1)
@@ -186,12 +185,15 @@ class NewtonMatrix:
         self.frame = turned / jnp.where(rotated, length, 1)
         H = self.rotate(Q.reshape(k, d, k * d, batch)).reshape(k * d, k * d, batch).swapaxes(0, 1)
         H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
-        # The contact's own block is W^-2 + D e_n e_n^T = (sum_j a_j r_j r_j^T) + D e_n e_n^T in either frame, with r_j
-        # the eigenvectors and a_j the eigenvalues.
-        eigenvectors = jnp.where(rotated, eye, turn / length)  # [:, :, j] = r_j
-        normal = jnp.where(rotated, turn / length, eye)[:, 0]
-        block = jnp.sum((scaling.inverse**2)[:, None, None] * eigenvectors[:, :, None] * eigenvectors[:, None], axis=3)
-        block = block + curvature[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        # The contact's own block is W^-2 + D e_n e_n^T: across the tangent W^-2 alone, and here the rest of it.
+        squared, D = scaling.inverse**2, curvature
+        mean, half = (squared[:, 0] + squared[:, 1]) / 2, (squared[:, 0] - squared[:, 1]) / 2
+        first = jnp.where(rotated[:, 0, 0], squared[:, 0] + D / 2, mean + D)
+        second = jnp.where(rotated[:, 0, 0], squared[:, 1] + D / 2, mean)
+        both = jnp.where(rotated[:, 0, 0], D / 2, half)
+        zero = jnp.zeros_like(D)
+        rows = [[first, both, zero], [both, second, zero], [zero, zero, squared[:, -1]]]
+        block = jnp.stack([jnp.stack(row[:d], axis=1) for row in rows[:d]], axis=1)
         index = jnp.arange(k)
         H = H.at[index, :, index].add(block)
         H = H.reshape(k * d, k * d, batch)
