@@ -20,7 +20,7 @@ from carom.learning.train import Rates, fresh_state, learn, train_step
 from carom.simulation.rollout import Stepper, simulate
 
 TINY = carom.LearnConfig(
-    epochs=2, chunks_per_epoch=16, batch_size=16, chunk_length=3, width=8, depth=1, checkpoint_every=1
+    epochs=2, chunks_per_epoch=16, batch_size=16, chunk_length=3, width=8, depth=1, checkpoint_every=1, refine=False
 )
 
 

@@ -11,12 +11,14 @@ from systems import refused
 
 import carom
 from carom.learning.dataset import Dataset
-from carom.learning.models import NeuralPotential, mass_ratios
+from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
+from carom.learning.refine import polish
 from carom.learning.run import RunFolder
 from carom.learning.train import initial_unknowns, learn
+from carom.simulation.rollout import Stepper
 
 TINY = carom.LearnConfig(
-    epochs=4, chunks_per_epoch=32, batch_size=16, chunk_length=3, width=16, depth=1, checkpoint_every=1
+    epochs=4, chunks_per_epoch=32, batch_size=16, chunk_length=3, width=16, depth=1, checkpoint_every=1, refine=False
 )
 
 
@@ -72,6 +74,34 @@ def test_early_stopping_keeps_the_best(cp3, cp3_data):
     _, report = learn(cp3, cp3_data, config, progress=False)
     assert report.stopped_early
     assert report.epochs < 40
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_the_refinement_at_the_end_brings_all_that_is_learned_nearer(cp3, cp3_data, tmp_path):
+    config = dataclasses.replace(TINY, epochs=60, chunks_per_epoch=64, width=32, learning_rate=1e-2)
+    run = RunFolder.create(tmp_path / "run", {})
+    rough, before = learn(cp3, cp3_data, config, run=run, progress=False)
+    run.close()
+    # The same training goes on, from its end.
+    run = RunFolder.open(tmp_path / "run")
+    refined, after = learn(cp3, cp3_data, dataclasses.replace(config, refine=True), run=run, progress=False)
+    run.close()
+    assert not before.refined
+    assert after.refined
+    assert after.val_loss < 0.5 * before.val_loss
+    rough_error, refined_error = (np.abs(numbers(system) - numbers(cp3)).max() for system in (rough, refined))
+    assert refined_error < 0.1 * rough_error
+
+
+def test_what_cannot_be_refined_is_left_as_it_is(cp3, cp3_data):
+    train = cp3_data.train
+    stepper = Stepper(dt=jnp.asarray(train.dt))
+    unknowns, rope = initial_unknowns(cp3, TINY), carom.task("rope-50")
+    baseline = eqx.tree_at(lambda u: u.step_model, unknowns, carom.Gravity((0.0, -1.0)), is_leaf=lambda a: a is None)
+    assert polish(Unknowns(None, None, None, None), cp3, stepper, train) is None
+    assert polish(baseline, cp3, stepper, train) is None
+    assert polish(initial_unknowns(rope, TINY), rope, stepper, train) is None
 
 
 @pytest.mark.slow

@@ -49,6 +49,9 @@ class LearnConfig:
     """Weight decay of the network (physical quantities are not decayed)."""
     patience: int = 200
     """Stop after so many epochs without a better validation loss."""
+    refine: bool = True
+    """At the end, refine masses, contact properties and the potential's linear weights by Gauss-Newton steps; the
+    result is kept if it validates better. For systems of up to 40 points, not for baselines."""
     width: int = 256
     """Units in a hidden layer of the potential, and of the contact network of mlp-cd-clnn."""
     depth: int = 3

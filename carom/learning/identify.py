@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float
 from carom.checks import require
 from carom.learning.dataset import closing
 from carom.learning.models import Unknowns
-from carom.learning.refine import IdentifyConfig, Problem, choose_steps, principal_forces, refine, unknowns_of
+from carom.learning.refine import MOST_POINTS, IdentifyConfig, new_problem, refine, unknowns_of
 from carom.learning.robust import Solution
 from carom.learning.sensitivity import StepSensitivity
 from carom.mechanics.dynamics import Formulation
@@ -42,8 +42,6 @@ from carom.simulation.rollout import COMPENSATION_STEPS, Stepper
 from carom.system import System
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified"]
-MOST_POINTS = 40
-"""Largest system that `identify` takes: derivatives of a step by the state before it grow with the cube of its size."""
 SMALLEST_ERROR = 1e-6
 """No standard error is reported smaller than this: the contact solver's own accuracy."""
 
@@ -119,10 +117,8 @@ def identify(
     )
     unknowns = unknowns_of(system, learned)
     impacts = closing(recording, system)
-    steps, most = choose_steps(recording, system, config)
-    # Room for as many contacts as the steps close at once, and two more for what the ballistic guess misses.
-    skeleton = system.with_max_active(most + 2) if system.contacts else system
-    problem = Problem(unknowns, skeleton, stepper, recording, steps, principal_forces(unknowns, recording, steps))
+    problem = new_problem(unknowns, system, stepper, recording, config)
+    require(len(problem.steps) > 0, "the recording has no step that starts without contact.")
     fitted, solution, seen = refine(problem, config)
     contact = count_contacts(system.n_properties, seen, solution.weight)
     return Identification(

@@ -50,3 +50,9 @@ class TrainingProgress:
             self.console.print(
                 f"epoch {epoch}/{self.epochs}  {metrics['seconds']:.0f} s  {text}", soft_wrap=True, highlight=False
             )
+
+    def say(self, text: str) -> None:
+        """Show what is done after the epochs."""
+        self.live.update(self.bar, text=text)
+        if not self.console.is_terminal:
+            self.console.print(text, highlight=False)

@@ -1,7 +1,12 @@
-"""The estimator behind `identify`: which recorded steps it looks at, and how it refines the learned values."""
+"""The estimator behind `identify` and the end of a training: which recorded steps it looks at, and how it refines.
+
+A step of Gauss and Newton moves masses, contact properties and the linear weights of the potential at once. So it goes
+straight to where the gradient steps of a training, which take one after the other, creep along a valley.
+"""
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from carom.checks import require
 from carom.learning.dataset import all_gaps
 from carom.learning.models import NeuralPotential, Unknowns
 from carom.learning.robust import Blocks, Solution, solve
@@ -18,6 +22,8 @@ from carom.simulation.files import Recording
 from carom.simulation.rollout import Stepper
 from carom.system import System
 
+MOST_POINTS = 40
+"""Largest system that is refined: derivatives of a step by the state before it grow with the cube of its size."""
 BATCH = 250
 """Steps that are looked at together."""
 
@@ -38,6 +44,13 @@ class IdentifyConfig:
     """Fewer impacts that speak about a quantity do not identify it, whatever their standard error."""
     max_standard_error: float = 0.05
     """A quantity with a larger standard error (of mass ratios: relative) is not identified."""
+    directions: int = 100
+    """Most principal directions of the potential's forces to estimate along with the physical parameters."""
+    smallest_force: float = 1e-5
+    """Directions are left out whose root mean square force is less than this share of the largest."""
+    redescend: bool = True
+    """Leave out steps that do not fit (see `robust.py`), and take errors to be of the size seen at the start.
+    Otherwise steps that do not fit have less weight only, and errors are those left by the last round."""
     seed: int = 0
     """Which steps are used where there are more."""
 
@@ -73,7 +86,6 @@ def choose_steps(recording: Recording, system: System, config: IdentifyConfig) -
         smooth += [(k, s) for s in start[~hit]]
         touched += [((k, s), np.unique(index[closed[s]])) for s in start[hit]]
         most = max(most, int(closed[start].sum(axis=-1).max(initial=0)))
-    require(len(touched) + len(smooth) > 0, "the recording has no step that starts without contact.")
     by_property = [[n for n, (_, hit) in enumerate(touched) if p in hit] for p in range(P)]
     seen = sum(bool(steps) for steps in by_property)
     chosen: set[int] = set()
@@ -81,7 +93,7 @@ def choose_steps(recording: Recording, system: System, config: IdentifyConfig) -
         chosen.update(rng.permutation(steps)[: config.impacts // max(seen, 1)].astype(int).tolist())
     free = rng.permutation(len(smooth))[: config.smooth_steps]
     out = [touched[n][0] for n in sorted(chosen)] + [smooth[n] for n in sorted(free)]
-    return np.array(out, int), most
+    return np.array(out, int).reshape(-1, 2), most
 
 
 # --- the estimator ------------------------------------------------------------------------------------------------
@@ -96,16 +108,16 @@ class Problem:
     stepper: Stepper
     recording: Recording
     steps: Int[np.ndarray, "S 2"]
-    features: Float[np.ndarray, "W F"] | None
+    features: Float[np.ndarray, "W F"]
 
 
 def principal_forces(unknowns: Unknowns, recording: Recording, steps, *, most: int = 100, smallest: float = 1e-5):
-    """The principal directions (W, F) of the forces of a network's linear weights; None without a network.
+    """The principal directions (W, F) of the forces of a network's linear weights; F = 0 without a network.
 
     At most `most`, with a root mean square force of at least `smallest` of the largest one's.
     """
     if unknowns.potential is None:
-        return None
+        return np.zeros((0, 0))
     x = jnp.asarray(recording.x[steps[:, 0], steps[:, 1]][:: max(1, len(steps) // 500)])
     forces = np.asarray(eqx.filter_jit(eqx.filter_vmap(force_features, in_axes=(None, 0)))(unknowns.potential, x))
     forces = forces.reshape(-1, forces.shape[-1])
@@ -114,58 +126,102 @@ def principal_forces(unknowns: Unknowns, recording: Recording, steps, *, most: i
 
 
 @eqx.filter_jit
-def _sensitivities(unknowns, skeleton, stepper, features, x0, v0, x1, v1):
-    return jax.vmap(lambda a, b, c, d: step_sensitivity(unknowns, skeleton, stepper, features, (a, b), (c, d)))(
-        x0, v0, x1, v1
-    )
+def _sensitivities(unknowns, skeleton, stepper, x0, v0, x1, v1):
+    return jax.vmap(lambda a, b, c, d: step_sensitivity(unknowns, skeleton, stepper, (a, b), (c, d)))(x0, v0, x1, v1)
 
 
 def sensitivities(problem: Problem, unknowns: Unknowns) -> StepSensitivity:
-    """Of all steps, in batches of a size that hardly depends on their number: each size is a program to compile."""
+    """Of all steps, in batches of a size that hardly depends on their number: each size is a program to compile.
+
+    Those by the linear weights are along the directions `problem.features`.
+    """
     trajectory, start = problem.steps.T
     count = len(start)
     size = min(BATCH, 1 << (count - 1).bit_length())
-    features = None if problem.features is None else jnp.asarray(problem.features)
     x, v = problem.recording.x, problem.recording.v
     parts = []
     for first in range(0, count, size):
         rows = np.arange(first, first + size).clip(max=count - 1)
         k, s = trajectory[rows], start[rows]
         states = (jnp.asarray(part) for part in (x[k, s], v[k, s], x[k, s + 1], v[k, s + 1]))
-        out = _sensitivities(unknowns, problem.skeleton, problem.stepper, features, *states)
-        parts.append(out)
+        out = _sensitivities(unknowns, problem.skeleton, problem.stepper, *states)
+        parts.append(out._replace(weights=np.asarray(out.weights) @ problem.features))
     return jax.tree.map(lambda *a: np.concatenate(a)[:count], *parts)
 
 
-def refine(problem: Problem, config: IdentifyConfig) -> tuple[Unknowns, Solution, StepSensitivity]:
+def new_problem(
+    unknowns: Unknowns, system: System, stepper: Stepper, recording: Recording, config: IdentifyConfig
+) -> Problem:
+    """Chooses the steps of `recording` to look at, none of which starts in contact, and the forces that may change."""
+    steps, most = choose_steps(recording, system, config)
+    # Room for as many contacts as the steps close at once, and two more for what the ballistic guess misses.
+    skeleton = system.with_max_active(most + 2) if system.contacts else system
+    features = principal_forces(unknowns, recording, steps, most=config.directions, smallest=config.smallest_force)
+    return Problem(unknowns, skeleton, stepper, recording, steps, features)
+
+
+class Refined(NamedTuple):
     """The parameters of the robust estimator, its last solution, and the steps with their last linearisation."""
-    theta = start = _vector(problem.unknowns)
-    count = len(theta)
-    bias = np.zeros(0 if problem.features is None else problem.features.shape[1])
-    seen = sensitivities(problem, problem.unknowns)
+
+    unknowns: Unknowns
+    solution: Solution
+    seen: StepSensitivity
+
+
+def refine(problem: Problem, config: IdentifyConfig) -> Refined:
+    """Gauss-Newton steps from `problem.unknowns` to the parameters that fit the steps best."""
+    unknowns, count = problem.unknowns, len(_vector(problem.unknowns))
+
+    def whole(physical, rest: float):
+        return np.concatenate([physical, np.full(problem.features.shape[1], rest)])
+
+    # A prior of standard deviation 1 on all physical parameters, which says nothing where data speak.
+    prior = whole(np.ones(count), _ridge(problem))
+    most = whole(np.full(count, 0.5), np.inf)
+    lower, upper = (whole(end, rest) for end, rest in zip(_bounds(unknowns), (-np.inf, np.inf), strict=True))
+    changed = np.zeros(len(prior))
+    seen = sensitivities(problem, unknowns)
     errors = error_sizes(seen, problem.recording)
     kept = beyond_doubt(seen, errors, config.doubt)
-    lower, upper = _bounds(problem.unknowns)
-    free = np.full(len(bias), np.inf)
-    # A prior of standard deviation 1 on all physical parameters, which says nothing where data speak.
-    prior = np.concatenate([np.ones(count), np.full(len(bias), _ridge(problem))])
     k = 0
     while True:
         seen = _those(seen, kept)
+        now = whole(_vector(unknowns), 0.0)
         solution = solve(
-            whitened(seen, problem, errors, kept, bias),
+            whitened(seen, problem, errors, kept),
             prior,
-            np.concatenate([start - theta, -bias]),
-            np.concatenate([np.maximum(lower - theta, -0.5), -free]),
-            np.concatenate([np.minimum(upper - theta, 0.5), free]),
-            redescend=k > 0,
+            -changed,
+            np.maximum(lower - now, -most),
+            np.minimum(upper - now, most),
+            redescend=config.redescend and k > 0,
         )
-        theta = theta + solution.change[:count]
+        changed = changed + solution.change
+        unknowns = _moved(problem, changed)
         k += 1
         if k == config.rounds or (k > 2 and _settled(solution, count)):
-            return _unknowns(problem.unknowns, theta), solution, seen
-        bias = bias + solution.change[count:]
-        seen = sensitivities(problem, _unknowns(problem.unknowns, theta))
+            return Refined(unknowns, solution, seen)
+        seen = sensitivities(problem, unknowns)
+        if not config.redescend:
+            errors = error_sizes(seen, problem.recording)
+
+
+POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=256, smallest_force=1e-7, redescend=False)
+"""How a training ends. Steps that do not fit keep some weight: a model that is not there yet is not a wrong one."""
+
+
+def polish(unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording) -> Unknowns | None:
+    """Learned unknowns, refined; None where that cannot be.
+
+    It cannot for networks in place of contacts or steps, for systems of more than `MOST_POINTS` points, in single
+    precision, which rounding leaves too little of one step's error, where nothing physical or neural is unknown, and
+    where no recorded step starts without contact.
+    """
+    networks = unknowns.contact_model is not None or unknowns.step_model is not None
+    nothing = unknowns.potential is None and not _physical(unknowns)
+    if networks or nothing or skeleton.n_points > MOST_POINTS or skeleton.friction.dtype != jnp.float64:
+        return None
+    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, POLISH)
+    return refine(problem, POLISH).unknowns if len(problem.steps) else None
 
 
 def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivity:
@@ -184,28 +240,42 @@ def _ridge(problem: Problem) -> float:
     return float(1 / np.mean(np.concatenate(weights) ** 2))
 
 
+PHYSICAL = {"log_mass_ratio": (-np.inf, np.inf), "friction": (0.0, np.inf), "restitution": (0.0, 1.0)}
+"""The physical parameters, in their order in a vector, and the bounds of each."""
+
+
+def _physical(unknowns: Unknowns) -> dict[str, Float[np.ndarray, " _"]]:
+    """Those that are unknown."""
+    parts = {name: getattr(unknowns, name) for name in PHYSICAL}
+    return {name: np.asarray(part, float) for name, part in parts.items() if part is not None}
+
+
 def _vector(unknowns: Unknowns) -> Float[np.ndarray, " p"]:
-    parts = (unknowns.log_mass_ratio, unknowns.friction, unknowns.restitution)
-    return np.concatenate([np.zeros(0) if part is None else np.asarray(part, float) for part in parts])
+    return np.concatenate([np.zeros(0), *_physical(unknowns).values()])
 
 
-def _unknowns(like: Unknowns, theta: Float[np.ndarray, " p"]) -> Unknowns:
-    out, first = like, 0
-    for name in ("log_mass_ratio", "friction", "restitution"):
-        part = getattr(like, name)
-        if part is not None:
-            value = jnp.asarray(theta[first : first + len(part)], part.dtype)
-            out, first = eqx.tree_at(lambda u, name=name: getattr(u, name), out, value), first + len(part)
-    return out
-
-
-def _bounds(unknowns: Unknowns) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    ends = {"log_mass_ratio": (-np.inf, np.inf), "friction": (0.0, np.inf), "restitution": (0.0, 1.0)}
-    lower, upper = (
-        np.concatenate([np.full(0 if (p := getattr(unknowns, n)) is None else len(p), e[k]) for n, e in ends.items()])
+def _bounds(unknowns: Unknowns) -> list[Float[np.ndarray, " p"]]:
+    """Lower and upper bounds of the physical parameters."""
+    sizes = {name: len(part) for name, part in _physical(unknowns).items()}
+    return [
+        np.concatenate([np.zeros(0), *(np.full(size, PHYSICAL[name][k]) for name, size in sizes.items())])
         for k in range(2)
-    )
-    return lower, upper
+    ]
+
+
+def _moved(problem: Problem, change: Float[np.ndarray, " p"]) -> Unknowns:
+    """The unknowns of the problem, changed: physical parameters first, then along `features`."""
+    out, first = problem.unknowns, 0
+    for name, part in _physical(out).items():
+        value = jnp.asarray(part + change[first : first + len(part)], getattr(out, name).dtype)
+        out, first = eqx.tree_at(lambda u, name=name: getattr(u, name), out, value), first + len(part)
+    if out.potential is None:
+        return out
+    old = out.potential.linear_weights()
+    ends = np.cumsum([w.size for w in old])[:-1]
+    by = np.split(problem.features @ change[first:], ends)
+    new = tuple(jnp.asarray(np.asarray(w, float) + d.reshape(w.shape), w.dtype) for w, d in zip(old, by, strict=True))
+    return eqx.tree_at(lambda u: u.potential, out, out.potential.with_linear_weights(new))
 
 
 def error_sizes(seen: StepSensitivity, recording: Recording) -> Float[np.ndarray, " R"]:
@@ -230,7 +300,7 @@ def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: 
     return sure.all(axis=1) & finite
 
 
-def whitened(seen: StepSensitivity, problem: Problem, errors, kept, bias) -> Blocks:
+def whitened(seen: StepSensitivity, problem: Problem, errors, kept) -> Blocks:
     """Residuals and Jacobians in units of their standard deviation, by step."""
     unknowns, P = problem.unknowns, problem.skeleton.n_properties
     steps, rows = seen.residual.shape
@@ -241,8 +311,7 @@ def whitened(seen: StepSensitivity, problem: Problem, errors, kept, bias) -> Blo
             for k in range(seen.column.shape[1]):
                 dense[np.arange(steps), :, seen.column[:, k]] += getattr(seen, name)[:, :, k]
             columns.append(dense[:, :, :P])
-    jacobian = np.concatenate([*columns, seen.features], axis=2)
-    residual = seen.residual + seen.features @ bias
+    jacobian = np.concatenate([*columns, seen.weights], axis=2)
     spread = seen.state * errors
     covariance = spread @ spread.transpose(0, 2, 1) + np.diag(errors**2)
     # In units of the errors, so that positions and velocities are alike in size. What rounding leaves of a step that
@@ -250,7 +319,7 @@ def whitened(seen: StepSensitivity, problem: Problem, errors, kept, bias) -> Blo
     covariance = covariance / (errors[:, None] * errors)
     largest = np.max(np.diagonal(covariance, axis1=1, axis2=2), axis=1)
     factor = np.linalg.cholesky(covariance + 1e-14 * len(errors) * largest[:, None, None] * np.eye(len(errors)))
-    both = np.concatenate([residual[..., None], jacobian], axis=2) / errors[:, None]
+    both = np.concatenate([seen.residual[..., None], jacobian], axis=2) / errors[:, None]
     both = np.linalg.solve(factor, both)
     kind = np.any(seen.gap < 0, axis=1).astype(int)
     return Blocks(both[..., 0], both[..., 1:], problem.steps[kept, 0], kind)

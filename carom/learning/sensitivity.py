@@ -19,7 +19,7 @@ class StepSensitivity(NamedTuple):
 
     `residual`, predicted minus recorded; its derivatives by `log_mass_ratio`, by `friction` and `restitution` of the
     properties `column` of the closed contacts (P, the number of properties, for unused places), by the `state` before
-    the step, by a `force` held over the step, and by the network's output `features` (none without a network).
+    the step, and by the linear weights of a neural potential (none without one), see `force_features`.
     `gap_before`, `gap`: of every contact at the recorded start and at the predicted end; `gap_slope`, derivative of the
     former by positions; `property` of each contact in the solver (P for an unused place); `jump`, how far the contacts
     changed the velocities (m/s, norm over all points); normal and tangential impulses (N s) by phase, see `Jump`.
@@ -30,7 +30,7 @@ class StepSensitivity(NamedTuple):
     friction: Float[Array, "R K"]
     restitution: Float[Array, "R K"]
     state: Float[Array, "R R"]
-    features: Float[Array, "R F"]
+    weights: Float[Array, "R W"]
     column: Int[Array, " K"]
     gap_before: Float[Array, " C"]
     gap: Float[Array, " C"]
@@ -41,13 +41,11 @@ class StepSensitivity(NamedTuple):
     tangential: Float[Array, "phases K"]
 
 
-def step_sensitivity(
-    unknowns: Unknowns, skeleton: System, stepper: Stepper, features: Float[Array, "W F"] | None, start, end
-) -> StepSensitivity:
+def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, start, end) -> StepSensitivity:
     """Of the step from the recorded state `start` to `end`, each `(x, v)`.
 
     The Jacobian has a column for the properties of the closed contacts only, so that its cost does not grow with the
-    number of properties. `features` are directions in the network's linear weights, see `force_features`.
+    number of properties. To first order in the time step: forces of the weights are those at the start, held over it.
     """
     x, v = start
     system = unknowns.assemble(skeleton)
@@ -87,7 +85,7 @@ def step_sensitivity(
         friction=rows("friction"),
         restitution=rows("restitution"),
         state=jnp.concatenate([rows("x"), rows("v")], axis=1),
-        features=rows("force") @ force_features(unknowns.potential, x, features),
+        weights=rows("force") @ force_features(unknowns.potential, x),
         column=column,
         gap_before=system.gaps(x),
         gap=system.gaps(before.x),
@@ -110,10 +108,8 @@ def _nudged(unknowns: Unknowns, nudge, column, skeleton: System) -> System:
     return eqx.tree_at(lambda s: (s.friction, s.restitution), system, (friction, restitution))
 
 
-def force_features(
-    potential: NeuralPotential | None, x: Float[Array, "n d"], directions: Float[Array, "W F"] | None = None
-) -> Float[Array, "nd F"]:
-    """Generalised force (N) of a unit change of the weights in which the potential is linear, along `directions`.
+def force_features(potential: NeuralPotential | None, x: Float[Array, "n d"]) -> Float[Array, "nd W"]:
+    """Generalised force (N) of a unit change of each weight in which the potential is linear.
 
     These are all the forces that the output layer of the network and the energy of the segments can add.
     """
@@ -128,5 +124,4 @@ def force_features(
         return jnp.concatenate([g.reshape(-1) for g in jax.grad(value, argnums=1)(x, weights)])
 
     force = -jax.jacfwd(slope)(x).reshape(-1, x.size).T
-    force = force.astype(x.dtype)
-    return force if directions is None else force @ directions
+    return force.astype(x.dtype)

@@ -20,6 +20,7 @@ from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.progress import TrainingProgress
+from carom.learning.refine import polish
 from carom.learning.run import RunFolder
 from carom.simulation.files import Recording
 from carom.simulation.rollout import Stepper, step
@@ -40,6 +41,8 @@ class LearnReport:
     stopped_early: bool
     skipped_steps: int
     overflowed_contacts: int
+    refined: bool
+    """Whether the refinement at the end (`LearnConfig.refine`) validated better, and is what was kept."""
     epsilon: float | None = None
     """Of the contact model CMr."""
 
@@ -300,7 +303,8 @@ def learn(
     - `run`: a folder to keep metrics and checkpoints in. If it holds a checkpoint, the training goes on from there.
     - `progress`: show it.
 
-    **Returns:** the learned system (of the best validation loss), and a report.
+    **Returns:** the learned system (of the best validation loss), and a report. Unless `config.refine` is off, steps of
+    Gauss and Newton refine it at the end (see `carom.learning.refine`), if that validates better.
 
     **Raises:** `CaromError` if data, skeleton and configuration do not fit, or the loss stays not finite.
     """
@@ -370,16 +374,25 @@ def learn(
             if epoch - int(state.best_epoch) >= config.patience:
                 stopped = True
                 break
-    system = state.best.assemble(skeleton)
+        best, val_loss = state.best, float(state.best_loss)
+        if config.refine:
+            if shown is not None:
+                shown.say("refining ...")
+            refined = polish(best, trained, stepper, train)
+            refined_loss = np.inf if refined is None else float(validate(refined, trained, *held_out, stepper))
+            if refined is not None and refined_loss < val_loss:
+                best, val_loss = refined, refined_loss
+    system = best.assemble(skeleton)
     report = LearnReport(
         **quantities(system),
         train_loss=float(loss),
-        val_loss=float(state.best_loss),
+        val_loss=val_loss,
         epochs=int(state.epoch),
         seconds=time.monotonic() - started,
         stopped_early=stopped,
         skipped_steps=int(state.skipped),
         overflowed_contacts=int(state.overflow),
+        refined=best is not state.best,
     )
     return system, report
 
