@@ -42,8 +42,9 @@ def test_learning_lowers_the_loss_and_reports_it(cp3, cp3_data, tmp_path):
 
 
 def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path):
+    config = dataclasses.replace(TINY, refine=True)  # after epoch 2, and at the end
     whole = RunFolder.create(tmp_path / "whole", {})
-    expected, _ = learn(cp3, cp3_data, TINY, run=whole, progress=False)
+    expected, _ = learn(cp3, cp3_data, config, run=whole, progress=False)
     whole.close()
 
     class KilledError(Exception):
@@ -57,11 +58,11 @@ def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path)
 
     dying = Dying.create(tmp_path / "killed", {})
     with pytest.raises(KilledError):
-        learn(cp3, cp3_data, TINY, run=dying, progress=False)
+        learn(cp3, cp3_data, config, run=dying, progress=False)
     dying.close()
     again = RunFolder.open(tmp_path / "killed")
     assert again.metrics()[-1]["epoch"] == 3  # logged, but its checkpoint was not written
-    system, report = learn(cp3, cp3_data, TINY, run=again, progress=False)
+    system, report = learn(cp3, cp3_data, config, run=again, progress=False)
     again.close()
     assert report.epochs == 4
     assert [m["epoch"] for m in again.metrics()] == [1, 2, 3, 4]
@@ -79,7 +80,7 @@ def test_early_stopping_keeps_the_best(cp3, cp3_data):
 @pytest.mark.slow
 @pytest.mark.ci_budget
 def test_the_refinement_at_the_end_brings_all_that_is_learned_nearer(cp3, cp3_data, tmp_path):
-    config = dataclasses.replace(TINY, epochs=60, chunks_per_epoch=64, width=32, learning_rate=1e-2)
+    config = dataclasses.replace(TINY, epochs=60, chunks_per_epoch=64, learning_rate=1e-2)
     run = RunFolder.create(tmp_path / "run", {})
     rough, before = learn(cp3, cp3_data, config, run=run, progress=False)
     run.close()

@@ -28,7 +28,7 @@ class LearnConfig:
     (mlp-cd-clnn, in-cp-clnn) or for the whole step (in-cp-sp)."""
     learn: tuple[Quantity, ...] = ("mass", "friction", "restitution", "potential")
     """What is unknown; all else is taken from the skeleton. What a baseline's network replaces is left out."""
-    epochs: int = 250
+    epochs: int = 200
     """How often `chunks_per_epoch` chunks are drawn and learned from."""
     chunks_per_epoch: int = 800
     """Chunks drawn in an epoch, spread evenly over the trajectories."""
@@ -50,8 +50,8 @@ class LearnConfig:
     patience: int = 200
     """Stop after so many epochs without a better validation loss."""
     refine: bool = True
-    """At the end, refine masses, contact properties and the potential's linear weights by Gauss-Newton steps; the
-    result is kept if it validates better. For systems of up to 40 points, not for baselines."""
+    """Refine masses, contact properties and the potential's linear weights by Gauss-Newton steps, on the way and at the
+    end; the result is kept if it validates better. For systems of up to 40 points, not for baselines."""
     width: int = 256
     """Units in a hidden layer of the potential, and of the contact network of mlp-cd-clnn."""
     depth: int = 3

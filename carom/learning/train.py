@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from carom.checks import require
 from carom.contact.impulses import CMr, ContactModel
@@ -42,7 +42,7 @@ class LearnReport:
     skipped_steps: int
     overflowed_contacts: int
     refined: bool
-    """Whether the refinement at the end (`LearnConfig.refine`) validated better, and is what was kept."""
+    """Whether the refinement at the end (see `LearnConfig.refine`) validated better, and is what was kept."""
     epsilon: float | None = None
     """Of the contact model CMr."""
 
@@ -58,6 +58,7 @@ class TrainState(eqx.Module):
     epoch: Int[Array, ""]
     skipped: Int[Array, ""]
     overflow: Int[Array, ""]
+    settled: Bool[Array, ""]  # masses and contact properties: they have been refined
 
 
 def initial_unknowns(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> Unknowns:
@@ -110,6 +111,15 @@ def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
     return optax.cosine_decay_schedule(config.learning_rate, steps, exponent=2.0)
 
 
+REFINE_AFTER = 0.4
+"""Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
+
+The network goes on learning from there with the right masses, which it cannot tell from its own errors.
+"""
+SETTLED = 0.01
+"""What the rates of masses and contact properties are multiplied by once they have been refined."""
+
+
 class Rates(NamedTuple):
     """What the optimiser's steps are multiplied by. Data, not part of the program: all trainings share one."""
 
@@ -118,8 +128,8 @@ class Rates(NamedTuple):
     weight_decay: Float[Array, ""]  # of the networks
 
     @classmethod
-    def of(cls, config: LearnConfig, learning_rate: ArrayLike) -> "Rates":
-        share = config.property_learning_rate / config.learning_rate
+    def of(cls, config: LearnConfig, learning_rate: ArrayLike, settled: ArrayLike = False) -> "Rates":
+        share = config.property_learning_rate / config.learning_rate * jnp.where(settled, SETTLED, 1.0)
         # Single precision, so that networks in single precision stay what they are.
         return cls(*(jnp.asarray(a, jnp.float32) for a in (learning_rate, share, config.weight_decay)))
 
@@ -229,11 +239,15 @@ def validate(unknowns, skeleton, x, v, stepper):
 def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> TrainState:
     """The state before the first epoch; a network is scaled to `recording`."""
     unknowns = initial_unknowns(skeleton, config, recording)
-    with jax.numpy_dtype_promotion("standard"):
-        opt_state = make_optimizer(Rates.of(config, 0)).init(eqx.filter(unknowns, eqx.is_inexact_array))
     zero = jnp.asarray(0)
     infinity = jnp.asarray(jnp.inf)
-    return TrainState(unknowns, opt_state, unknowns, infinity, zero, zero, zero, zero)
+    optimizer = _fresh_optimizer(unknowns, config)
+    return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False))
+
+
+def _fresh_optimizer(unknowns: Unknowns, config: LearnConfig):
+    with jax.numpy_dtype_promotion("standard"):
+        return make_optimizer(Rates.of(config, 0)).init(eqx.filter(unknowns, eqx.is_inexact_array))
 
 
 def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
@@ -304,7 +318,7 @@ def learn(
     - `progress`: show it.
 
     **Returns:** the learned system (of the best validation loss), and a report. Unless `config.refine` is off, steps of
-    Gauss and Newton refine it at the end (see `carom.learning.refine`), if that validates better.
+    Gauss and Newton refine it on the way and at the end (see `carom.learning.refine`), if that validates better.
 
     **Raises:** `CaromError` if data, skeleton and configuration do not fit, or the loss stays not finite.
     """
@@ -344,10 +358,27 @@ def learn(
     started = time.monotonic() - before
     loss = jnp.asarray(jnp.nan)
     stopped = False
+
+    def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
+        """Unknowns that validate better than these, and how well they do."""
+        if shown is not None:
+            shown.say("refining ...")
+        new = polish(unknowns, trained, stepper, train)
+        new_loss = np.inf if new is None else float(validate(new, trained, *held_out, stepper))
+        return (new, new_loss) if new is not None and new_loss < val_loss else None
+
     with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
             state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
             val_loss = validate(state.unknowns, trained, *held_out, stepper)
+            if config.refine and epoch == round(REFINE_AFTER * config.epochs):
+                better = refined(state.unknowns, float(val_loss))
+                if better is not None:
+                    unknowns, val_loss = better
+                    optimizer = _fresh_optimizer(unknowns, config)
+                    state = dataclasses.replace(
+                        state, unknowns=unknowns, optimizer=optimizer, settled=jnp.asarray(True)
+                    )
             state = _keep_best(state, val_loss, epoch)
             metrics = {
                 "epoch": epoch,
@@ -375,13 +406,8 @@ def learn(
                 stopped = True
                 break
         best, val_loss = state.best, float(state.best_loss)
-        if config.refine:
-            if shown is not None:
-                shown.say("refining ...")
-            refined = polish(best, trained, stepper, train)
-            refined_loss = np.inf if refined is None else float(validate(refined, trained, *held_out, stepper))
-            if refined is not None and refined_loss < val_loss:
-                best, val_loss = refined, refined_loss
+        better = refined(best, val_loss) if config.refine else None
+        best, val_loss = (best, val_loss) if better is None else better
     system = best.assemble(skeleton)
     report = LearnReport(
         **quantities(system),
@@ -392,7 +418,7 @@ def learn(
         stopped_early=stopped,
         skipped_steps=int(state.skipped),
         overflowed_contacts=int(state.overflow),
-        refined=best is not state.best,
+        refined=better is not None,
     )
     return system, report
 
@@ -417,7 +443,13 @@ def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, rate, stepper,
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
         data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
         unknowns, opt_state, loss, over, bad = train_step(
-            data, unknowns, opt_state, Rates.of(config, rate(done + count)), stepper, config.states, width
+            data,
+            unknowns,
+            opt_state,
+            Rates.of(config, rate(done + count), state.settled),
+            stepper,
+            config.states,
+            width,
         )
         losses.append(loss)
         overflow, skipped = overflow + over, skipped + bad.astype(skipped.dtype)
@@ -430,7 +462,9 @@ def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, rate, stepper,
 def _keep_best(state: TrainState, val_loss, epoch: int) -> TrainState:
     if not float(val_loss) < float(state.best_loss):
         return state
-    return dataclasses.replace(state, best=state.unknowns, best_loss=val_loss, best_epoch=jnp.asarray(epoch))
+    return dataclasses.replace(
+        state, best=state.unknowns, best_loss=jnp.asarray(val_loss), best_epoch=jnp.asarray(epoch)
+    )
 
 
 def quantities(system: System) -> dict[str, Any]:
