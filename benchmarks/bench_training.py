@@ -15,7 +15,8 @@ import pytest
 
 import carom
 from carom.learning.dataset import Chunks, closed_contacts
-from carom.learning.train import Rates, fresh_state, gather_chunks, train_step
+from carom.learning.optimizer import Rates
+from carom.learning.train import fresh_state, gather_chunks, train_step
 from carom.simulation.rollout import Stepper
 
 CONFIG = carom.LearnConfig()

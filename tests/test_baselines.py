@@ -24,7 +24,8 @@ from carom.learning.baselines import (
 )
 from carom.learning.baselines.graph import WORLD, Graph
 from carom.learning.dataset import Chunks, Dataset
-from carom.learning.train import Rates, fresh_state, learn, train_step
+from carom.learning.optimizer import Rates
+from carom.learning.train import fresh_state, learn, train_step
 from carom.simulation.rollout import Stepper, contact_jump, step
 
 NARROW = {"relation_width": 16, "object_width": 16}

@@ -11,7 +11,7 @@ import pytest
 import carom
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
-from carom.learning.train import Rates, make_optimizer
+from carom.learning.optimizer import Rates, make_optimizer
 
 
 @pytest.fixture(scope="module")

@@ -3,14 +3,13 @@
 import contextlib
 import dataclasses
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import require
 from carom.contact.impulses import CMr, ContactModel
@@ -19,6 +18,7 @@ from carom.learning.baselines import BASELINES, new_baseline, physical_quantitie
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
+from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule, make_optimizer
 from carom.learning.progress import TrainingProgress
 from carom.learning.refine import polish
 from carom.learning.run import RunFolder
@@ -106,57 +106,6 @@ def initial_baseline(skeleton: System, config: LearnConfig) -> ContactModel | St
     return new_baseline(config.model, skeleton, jax.random.fold_in(jax.random.key(config.seed), 1), **sizes)
 
 
-def learning_rate_schedule(config: LearnConfig, steps: int) -> optax.Schedule:
-    """Half a cosine, squared: in late steps the unknowns settle, which takes longer than finding where."""
-    return optax.cosine_decay_schedule(config.learning_rate, steps, exponent=2.0)
-
-
-REFINE_AFTER = 0.4
-"""Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
-
-The network goes on learning from there with the right masses, which it cannot tell from its own errors.
-"""
-SETTLED = 0.01
-"""What the rates of masses and contact properties are multiplied by once they have been refined."""
-
-
-class Rates(NamedTuple):
-    """What the optimiser's steps are multiplied by. Data, not part of the program: all trainings share one."""
-
-    learning_rate: Float[Array, ""]  # of the networks, now
-    property_share: Float[Array, ""]  # that of masses, friction and restitution over it
-    weight_decay: Float[Array, ""]  # of the networks
-
-    @classmethod
-    def of(cls, config: LearnConfig, learning_rate: ArrayLike, settled: ArrayLike = False) -> "Rates":
-        share = config.property_learning_rate / config.learning_rate * jnp.where(settled, SETTLED, 1.0)
-        # Single precision, so that networks in single precision stay what they are.
-        return cls(*(jnp.asarray(a, jnp.float32) for a in (learning_rate, share, config.weight_decay)))
-
-
-def make_optimizer(rates: Rates) -> optax.GradientTransformation:
-    """AdamW: weight decay for networks alone, a rate of their own for the properties."""
-    return optax.chain(
-        optax.adamw(rates.learning_rate, weight_decay=rates.weight_decay, mask=_is_network),
-        optax.masked(optax.scale(rates.property_share), _is_property),
-    )
-
-
-def _is_network(unknowns: Unknowns):
-    """Which arrays are weights of a network, or the coefficients beside it."""
-
-    def flag(path, _):
-        names = [getattr(key, "name", "") for key in path]
-        fixed = "segments" in names and names[-1] != "coefficients"  # the scales of a `SegmentEnergy`
-        return names[0] in ("potential", "contact_model", "step_model") and not fixed
-
-    return jax.tree_util.tree_map_with_path(flag, unknowns)
-
-
-def _is_property(unknowns: Unknowns):
-    return jax.tree.map(lambda flag: not flag, _is_network(unknowns))
-
-
 LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
 
@@ -241,13 +190,15 @@ def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | No
     unknowns = initial_unknowns(skeleton, config, recording)
     zero = jnp.asarray(0)
     infinity = jnp.asarray(jnp.inf)
-    optimizer = _fresh_optimizer(unknowns, config)
+    optimizer = fresh_optimizer(unknowns, config)
     return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False))
 
 
-def _fresh_optimizer(unknowns: Unknowns, config: LearnConfig):
-    with jax.numpy_dtype_promotion("standard"):
-        return make_optimizer(Rates.of(config, 0)).init(eqx.filter(unknowns, eqx.is_inexact_array))
+REFINE_AFTER = 0.4
+"""Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
+
+The network goes on learning from there with the right masses, which it cannot tell from its own errors.
+"""
 
 
 def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
@@ -375,7 +326,7 @@ def learn(
                 better = refined(state.unknowns, float(val_loss))
                 if better is not None:
                     unknowns, val_loss = better
-                    optimizer = _fresh_optimizer(unknowns, config)
+                    optimizer = fresh_optimizer(unknowns, config)
                     state = dataclasses.replace(
                         state, unknowns=unknowns, optimizer=optimizer, settled=jnp.asarray(True)
                     )
