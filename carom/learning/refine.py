@@ -185,6 +185,7 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
     kept = beyond_doubt(seen, errors, config.doubt)
     k = 0
     while True:
+        kept = kept & _finite(seen)
         seen = _those(seen, kept)
         now = whole(_vector(unknowns), 0.0)
         solution = solve(
@@ -296,8 +297,12 @@ def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: 
     """Steps in which no gap is so near to zero, before or after, that errors of the data decide what is closed."""
     margin = doubt * np.linalg.norm(seen.gap_slope * errors[: seen.gap_slope.shape[2]], axis=-1)
     sure = (seen.gap_before > margin) & (np.abs(seen.gap) > margin)
-    finite = np.isfinite(seen.residual).all(axis=1) & np.isfinite(seen.state).all(axis=(1, 2))
-    return sure.all(axis=1) & finite
+    return sure.all(axis=1)
+
+
+def _finite(seen: StepSensitivity) -> Bool[np.ndarray, " S"]:
+    """Steps whose end and its derivatives are finite: a solver may fail where the parameters make no sense yet."""
+    return np.isfinite(seen.residual).all(axis=1) & np.isfinite(seen.state).all(axis=(1, 2))
 
 
 def whitened(seen: StepSensitivity, problem: Problem, errors, kept) -> Blocks:

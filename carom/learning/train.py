@@ -106,6 +106,11 @@ def initial_baseline(skeleton: System, config: LearnConfig) -> ContactModel | St
     return new_baseline(config.model, skeleton, jax.random.fold_in(jax.random.key(config.seed), 1), **sizes)
 
 
+REFINE_AFTER = 0.4
+"""Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
+
+The network goes on learning from there with the right masses, which it cannot tell from its own errors.
+"""
 LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
 
@@ -192,13 +197,6 @@ def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | No
     infinity = jnp.asarray(jnp.inf)
     optimizer = fresh_optimizer(unknowns, config)
     return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False))
-
-
-REFINE_AFTER = 0.4
-"""Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
-
-The network goes on learning from there with the right masses, which it cannot tell from its own errors.
-"""
 
 
 def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
