@@ -296,8 +296,7 @@ def error_sizes(seen: StepSensitivity, recording: Recording) -> Float[np.ndarray
 def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: float) -> Bool[np.ndarray, " S"]:
     """Steps in which no gap is so near to zero, before or after, that errors of the data decide what is closed."""
     margin = doubt * np.linalg.norm(seen.gap_slope * errors[: seen.gap_slope.shape[2]], axis=-1)
-    sure = (seen.gap_before > margin) & (np.abs(seen.gap) > margin)
-    return sure.all(axis=1)
+    return np.asarray(((seen.gap_before > margin) & (np.abs(seen.gap) > margin)).all(axis=1))
 
 
 def _finite(seen: StepSensitivity) -> Bool[np.ndarray, " S"]:
