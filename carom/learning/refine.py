@@ -301,7 +301,8 @@ def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: 
 
 def _finite(seen: StepSensitivity) -> Bool[np.ndarray, " S"]:
     """Steps whose end and its derivatives are finite: a solver may fail where the parameters make no sense yet."""
-    return np.isfinite(seen.residual).all(axis=1) & np.isfinite(seen.state).all(axis=(1, 2))
+    flat = np.concatenate([seen.residual, seen.state.reshape(*seen.state.shape[:1], -1)], axis=1)
+    return np.all(np.isfinite(flat), axis=1)
 
 
 def whitened(seen: StepSensitivity, problem: Problem, errors, kept) -> Blocks:
