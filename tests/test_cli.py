@@ -256,4 +256,4 @@ def test_help_shows_every_default(capsys):
     text = capsys.readouterr().out
     for option in ("--data", "--resume", "--quick", "--epochs", "--learning-rate", "--model"):
         assert option in text
-    assert "(default: 250)" in " ".join(text.split())
+    assert f"(default: {carom.LearnConfig.epochs})" in " ".join(text.split())
