@@ -303,9 +303,9 @@ def learn(
 
     rate = learning_rate_schedule(config, config.epochs * steps)
     held_out = _validation_chunks(val, skeleton, config)
-    before = run.metrics()[-1]["seconds"] if run is not None and restored is not None else 0.0
-    started = time.monotonic() - before
-    loss = jnp.asarray(jnp.nan)
+    last = run.metrics()[-1] if run is not None and restored is not None else {"seconds": 0.0, "loss": np.nan}
+    started = time.monotonic() - last["seconds"]
+    loss = jnp.asarray(last["loss"])
     stopped = False
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
