@@ -185,7 +185,7 @@ class NewtonMatrix:
         self.frame = turned / jnp.where(rotated, length, 1)
         H = self.rotate(Q.reshape(k, d, k * d, batch)).reshape(k * d, k * d, batch).swapaxes(0, 1)
         H = self.rotate(H.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
-        # The contact's own block is W^-2 + D e_n e_n^T: across the tangent W^-2 alone, and here the rest of it.
+        # The contact's own block, W^-2 + D e_n e_n^T, in its frame; across the tangent it is W^-2 alone.
         squared, D = scaling.inverse**2, curvature
         mean, half = (squared[:, 0] + squared[:, 1]) / 2, (squared[:, 0] - squared[:, 1]) / 2
         first = jnp.where(rotated[:, 0, 0], squared[:, 0] + D / 2, mean + D)

@@ -207,7 +207,10 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
 
 
 POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=256, smallest_force=1e-7, redescend=False)
-"""How a training ends. Steps that do not fit keep some weight: a model that is not there yet is not a wrong one."""
+"""How a training refines, on the way and at its end.
+
+Steps that do not fit keep some weight: a model that is not there yet is not a wrong one.
+"""
 
 
 def polish(unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording) -> Unknowns | None:
