@@ -12,10 +12,9 @@ from systems import refused
 import carom
 from carom.learning.dataset import Dataset
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
-from carom.learning.refine import polish
+from carom.learning.refine import can_be_refined
 from carom.learning.run import RunFolder
 from carom.learning.train import initial_unknowns, learn
-from carom.simulation.rollout import Stepper
 
 TINY = carom.LearnConfig(
     epochs=4, chunks_per_epoch=32, batch_size=16, chunk_length=3, width=16, depth=1, checkpoint_every=1, refine=False
@@ -24,6 +23,13 @@ TINY = carom.LearnConfig(
 
 def numbers(system):
     return np.concatenate([system.friction, system.restitution, mass_ratios(system)])
+
+
+def in_single_precision(system):
+    """The same system, as it is made where double precision was not asked for."""
+    return jax.tree.map(
+        lambda a: a.astype(jnp.float32) if isinstance(a, jax.Array) and a.dtype == jnp.float64 else a, system
+    )
 
 
 def test_learning_lowers_the_loss_and_reports_it(cp3, cp3_data, tmp_path):
@@ -96,14 +102,20 @@ def test_the_refinement_at_the_end_brings_all_that_is_learned_nearer(cp3, cp3_da
     assert refined_error < 0.01 * rough_error
 
 
-def test_what_cannot_be_refined_is_left_as_it_is(cp3, cp3_data):
-    train = cp3_data.train
-    stepper = Stepper(dt=jnp.asarray(train.dt))
+def test_what_can_be_refined(cp3):
     unknowns, rope = initial_unknowns(cp3, TINY), carom.task("rope-50")
     baseline = eqx.tree_at(lambda u: u.step_model, unknowns, carom.Gravity((0.0, -1.0)), is_leaf=lambda a: a is None)
-    assert polish(Unknowns(None, None, None, None), cp3, stepper, train) is None
-    assert polish(baseline, cp3, stepper, train) is None
-    assert polish(initial_unknowns(rope, TINY), rope, stepper, train) is None
+    assert can_be_refined(unknowns, cp3)
+    assert not can_be_refined(unknowns, in_single_precision(cp3))
+    assert not can_be_refined(Unknowns(None, None, None, None), cp3)
+    assert not can_be_refined(baseline, cp3)
+    assert not can_be_refined(initial_unknowns(rope, TINY), rope)
+
+
+def test_single_precision_is_said_to_refine_nothing(cp3, cp3_data):
+    config = dataclasses.replace(TINY, refine=True, chunk_length=200)  # too long: nothing is trained
+    with pytest.warns(UserWarning, match="single precision"), refused("chunk_length is 200"):
+        learn(in_single_precision(cp3), cp3_data, config, progress=False)
 
 
 @pytest.mark.slow
@@ -170,10 +182,7 @@ def test_data_that_do_not_fit_the_system_are_refused(cp3, cp3_data):
 
 def test_single_precision_trains():
     """Data, masses and properties in single precision: the solver still runs in double inside."""
-    skeleton = jax.tree.map(
-        lambda a: a.astype(jnp.float32) if isinstance(a, jax.Array) and a.dtype == jnp.float64 else a,
-        carom.task("cp3"),
-    )
+    skeleton = in_single_precision(carom.task("cp3"))
     unknowns = initial_unknowns(skeleton, dataclasses.replace(TINY, learn=("friction",)))
     assert unknowns.friction.dtype == jnp.float32
     x0, v0 = (a.astype(jnp.float32) for a in carom.sample(carom.task("cp3"), jax.random.key(3), 16))

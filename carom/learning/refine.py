@@ -213,17 +213,20 @@ Steps that do not fit keep some weight: a model that is not there yet is not a w
 """
 
 
-def polish(unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording) -> Unknowns | None:
-    """Learned unknowns, refined; None where that cannot be.
+def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
+    """Whether `polish` has anything to do.
 
-    It cannot for networks in place of contacts or steps, for systems of more than `MOST_POINTS` points, in single
-    precision, which rounding leaves too little of one step's error, where nothing physical or neural is unknown, and
-    where no recorded step starts without contact.
+    It has not for networks in place of contacts or steps, for systems of more than `MOST_POINTS` points, in single
+    precision, which rounding leaves too little of one step's error, and where nothing physical or neural is unknown.
     """
     networks = unknowns.contact_model is not None or unknowns.step_model is not None
     nothing = unknowns.potential is None and not _physical(unknowns)
-    if networks or nothing or skeleton.n_points > MOST_POINTS or skeleton.friction.dtype != jnp.float64:
-        return None
+    double = skeleton.friction.dtype == jnp.float64
+    return double and skeleton.n_points <= MOST_POINTS and not (networks or nothing)
+
+
+def polish(unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording) -> Unknowns | None:
+    """Learned unknowns that `can_be_refined`, refined; None where no recorded step starts without contact."""
     problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, POLISH)
     return refine(problem, POLISH).unknowns if len(problem.steps) else None
 

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import time
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_fla
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule, make_optimizer
 from carom.learning.progress import TrainingProgress
-from carom.learning.refine import polish
+from carom.learning.refine import can_be_refined, polish
 from carom.learning.run import RunFolder
 from carom.simulation.files import Recording
 from carom.simulation.rollout import Stepper, step
@@ -274,6 +275,12 @@ def learn(
     config = LearnConfig() if config is None else config
     config.check()
     skeleton = config.prepare(skeleton)
+    if config.refine and skeleton.friction.dtype == jnp.float32:
+        warnings.warn(
+            "the system is in single precision, in which nothing is refined. For double precision, call "
+            'jax.config.update("jax_enable_x64", True) before it is made; refine=False silences this.',
+            stacklevel=2,
+        )
     most = check_dataset(skeleton, dataset, config)
     # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
     trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
@@ -307,6 +314,7 @@ def learn(
     started = time.monotonic() - last["seconds"]
     loss = jnp.asarray(last["loss"])
     stopped = False
+    refines = config.refine and can_be_refined(state.unknowns, trained)
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
         """Unknowns that validate better than these, and how well they do."""
@@ -320,7 +328,7 @@ def learn(
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
             state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
             val_loss = validate(state.unknowns, trained, *held_out, stepper)
-            if config.refine and epoch == round(REFINE_AFTER * config.epochs):
+            if refines and epoch == round(REFINE_AFTER * config.epochs):
                 better = refined(state.unknowns, float(val_loss))
                 if better is not None:
                     unknowns, val_loss = better
@@ -355,7 +363,7 @@ def learn(
                 stopped = True
                 break
         best, val_loss = state.best, float(state.best_loss)
-        better = refined(best, val_loss) if config.refine else None
+        better = refined(best, val_loss) if refines else None
         best, val_loss = (best, val_loss) if better is None else better
     system = best.assemble(skeleton)
     report = LearnReport(
