@@ -205,6 +205,16 @@ def test_truth_may_be_known_in_part(tmp_path, change):
     assert contact_properties(metrics, truth | change, tmp_path / "a.png").exists()
 
 
+def test_what_was_kept_is_marked(tmp_path):
+    metrics, truth = training(properties=2)
+    plain = contact_properties(metrics, truth, tmp_path / "plain.png").read_bytes()
+    kept = contact_properties(metrics, truth, tmp_path / "kept.png", kept=truth).read_bytes()
+    assert kept != plain
+    assert contact_properties(metrics, None, tmp_path / "a.png", kept=truth | {"friction": []}).exists()
+    with pytest.raises(CaromError, match=r"kept\['friction'\] must have 2 values.* it had 1"):
+        contact_properties(metrics, truth, tmp_path / "b.png", kept={"friction": [0.1]})
+
+
 @pytest.mark.parametrize("first_exact", [0, 10], ids=["always", "in the end"])
 def test_exact_values_have_a_place_on_the_error_axis(tmp_path, first_exact):
     metrics, truth = training()

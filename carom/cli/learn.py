@@ -236,7 +236,8 @@ def pictures(run: RunFolder, system: System, test: Recording, predicted: Traject
     if metrics:
         figures.learning_curves(metrics, run.path / "learning_curves.png")
     if metrics and metrics[-1]["friction"]:
-        figures.contact_properties(metrics, run.read_json(TRUTH), run.path / "contact_properties.png")
+        where, kept = run.path / "contact_properties.png", quantities(system)
+        figures.contact_properties(metrics, run.read_json(TRUTH), where, kept=kept)
     relative, _ = state_errors(test, predicted)
     figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")
     k = most_eventful(test)

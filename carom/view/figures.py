@@ -34,6 +34,9 @@ SMALLEST_SPAN = 0.1
 
 DASHES = (0, (4, 2))
 
+KEPT: dict[str, Any] = {"marker": "D", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.8}
+"""How the values of the system that was kept are marked."""
+
 NOT_FINITE = 1e300
 """Stands in for infinite values where quantiles are taken."""
 
@@ -89,13 +92,14 @@ def learning_curves(metrics: Sequence[Mapping[str, Any]], path: str | os.PathLik
 
 
 class _Quantity(NamedTuple):
-    """A row of the figure of contact properties; `learned` (epochs, P), `truth` (P,) or None."""
+    """A row of the figure of contact properties; `learned` (epochs, P), `truth` and `kept` (P,) or None."""
 
     label: str
     member: str
     color: str
     learned: np.ndarray
     truth: np.ndarray | None
+    kept: np.ndarray | None
     relative: bool
 
 
@@ -103,13 +107,16 @@ def contact_properties(
     metrics: Sequence[Mapping[str, Any]],
     truth: Mapping[str, Any] | None,
     path: str | os.PathLike[str],
+    *,
+    kept: Mapping[str, Any] | None = None,
 ) -> Path:
     """Friction, restitution, mass ratios and their errors over epochs; returns the PNG's path.
 
     **Arguments:** `metrics`, one mapping an epoch with `epoch` and the lists `friction`,
     `restitution` (P,) and `mass_ratio` (bodies,), each of which, and each value in it, may be
     missing, None or NaN; `truth`, the true lists by the same names, or None: then no errors are
-    shown. Mass ratios are left out where there is one body.
+    shown; `kept`, the lists of the system that was kept, which need not be the last epoch's.
+    Mass ratios are left out where there is one body.
 
     **Raises:** `CaromError` for values that are not numbers, a truth of another length than what
     was learned, or a path that cannot be written.
@@ -118,9 +125,9 @@ def contact_properties(
     quantities = [
         quantity
         for quantity in (
-            _quantity(rows, truth, "friction", "friction  μ", "contact", BLUE),
-            _quantity(rows, truth, "restitution", "restitution  e", "contact", VERMILLION),
-            _quantity(rows, truth, "mass_ratio", "mass ratio  $m_k / m_0$", "body", GREEN),
+            _quantity(rows, truth, kept, "friction", "friction  μ", "contact", BLUE),
+            _quantity(rows, truth, kept, "restitution", "restitution  e", "contact", VERMILLION),
+            _quantity(rows, truth, kept, "mass_ratio", "mass ratio  $m_k / m_0$", "body", GREEN),
         )
         if quantity.member == "contact" or quantity.learned.shape[1] > 1
     ]
@@ -141,9 +148,11 @@ def contact_properties(
                 Line2D([], [], color=MUTED, label="learned"),
                 Line2D([], [], color=MUTED, linestyle=DASHES, linewidth=1.1, label="true"),
             ]
+            if any(q.kept is not None for q in quantities):
+                handles.append(Line2D([], [], color=MUTED, linestyle="", **KEPT, label="kept"))
             if any(_is_crowded(q) for q in quantities):
                 handles.append(Line2D([], [], color=INK, linewidth=2, label="mean error"))
-            figure.legend(handles=handles, loc="outside upper left", ncols=3)
+            figure.legend(handles=handles, loc="outside upper left", ncols=4)
         return save_png(figure, path)
 
 
@@ -261,16 +270,19 @@ def _list(key: str, value: Any) -> list[float]:
     return [_number(key, v) for v in np.asarray(values, dtype=object).reshape(-1)]
 
 
-def _quantity(rows, truth, key: str, label: str, member: str, color: str) -> _Quantity:
+def _quantity(rows, truth, kept, key: str, label: str, member: str, color: str) -> _Quantity:
     lists = [_list(key, row.get(key)) for row in rows]
+    found = np.array(_list(key, None if kept is None else kept.get(key)))
     width = max(map(len, lists), default=0)
     learned = np.array([values + [np.nan] * (width - len(values)) for values in lists])
     true = np.array(_list(key, None if truth is None else truth.get(key)))
     if width and true.size not in (0, width):
         raise CaromError(f"truth[{key!r}] must have {width} values, as many as were learned; it had {true.size}.")
+    if width and found.size not in (0, width):
+        raise CaromError(f"kept[{key!r}] must have {width} values, as many as were learned; it had {found.size}.")
     learned = learned.reshape(len(rows), width)
-    known = bool(np.isfinite(true).any())
-    return _Quantity(label, member, color, learned, true if known else None, key == "mass_ratio")
+    true, found = (values if np.isfinite(values).any() else None for values in (true, found))
+    return _Quantity(label, member, color, learned, true, found, key == "mass_ratio")
 
 
 def _curves(time, curves, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -396,6 +408,9 @@ def _values_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
         style = {"alpha": 0.35, "linewidth": 0.7} if crowded else {"alpha": 0.8, "linewidth": 1.1}
         for value in np.unique(quantity.truth[np.isfinite(quantity.truth)]):
             axes.axhline(value, color=INK, linestyle=DASHES, zorder=3, **style)
+    if quantity.kept is not None:
+        for k, value in enumerate(quantity.kept):
+            axes.plot(epochs[-1], value, color=_color(quantity, k), zorder=4, clip_on=False, **KEPT)
     low, high = axes.get_ylim()
     if high - low < SMALLEST_SPAN:
         middle = (low + high) / 2
@@ -409,16 +424,15 @@ def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
     if quantity.truth is None:
         _empty(axes, "the truth is not known")
         return
-    error = np.abs(quantity.learned - quantity.truth)
-    if quantity.relative:
-        # The first mass is the unit: it has no error of its own.
-        error = error[:, 1:] / np.abs(quantity.truth[1:])
+    error = _error(quantity.learned, quantity)
     known = np.isfinite(error)
     if not known.any():
         _empty(axes, "none was recorded")
         return
     mean = np.where(known, error, 0).sum(axis=1) / np.where(known.any(axis=1), known.sum(axis=1), np.nan)
-    positive = error[known & (error > 0)]
+    kept = None if quantity.kept is None else _error(quantity.kept[None], quantity)[0]
+    seen = error[known] if kept is None else np.concatenate([error[known], kept[np.isfinite(kept)]])
+    positive = seen[seen > 0]
     floor = 10 ** (np.floor(np.log10(positive.min())) - 0.5) if positive.size else 1e-10
     crowded = _is_crowded(quantity)
     for k, values in enumerate(error.T):
@@ -427,13 +441,22 @@ def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
         _line(axes, epochs, np.maximum(values, floor), np.isfinite(values), clip_on=False, **style)
     if crowded:
         _line(axes, epochs, np.maximum(mean, floor), np.isfinite(mean), color=INK, linewidth=2)
+    for k, value in enumerate(() if kept is None else kept):
+        color = _color(quantity, k + quantity.relative)
+        axes.plot(epochs[-1], max(value, floor), color=color, zorder=4, clip_on=False, **KEPT)
     _log_axis(axes)
-    if (error[known] == 0).any():
+    if (seen == 0).any():
         _show_zero(axes, floor)
-    last = mean[np.isfinite(mean)][-1]
-    which = "final mean" if error.shape[1] > 1 else "final"
-    text = f"{which}: {power(float(last))}"
-    axes.set_title(text, fontsize=8, color=MUTED, loc="right")
+    last = mean[np.isfinite(mean)][-1] if kept is None else np.nanmean(kept)
+    which = f"{'final' if kept is None else 'kept'}{': mean' if error.shape[1] > 1 else ':'}"
+    axes.set_title(f"{which} {power(float(last))}", fontsize=8, color=MUTED, loc="right")
+
+
+def _error(values: np.ndarray, quantity: _Quantity) -> np.ndarray:
+    """Distance (rows, values) from the truth, relative for mass ratios."""
+    error = np.abs(values - quantity.truth)
+    # The first mass is the unit: it has no error of its own.
+    return error[:, 1:] / np.abs(quantity.truth[1:]) if quantity.relative else error
 
 
 def _name_lines(axes: Axes, quantity: _Quantity) -> None:
