@@ -76,6 +76,20 @@ def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path)
     assert [m["val_loss"] for m in again.metrics()] == [m["val_loss"] for m in whole.metrics()]
 
 
+def test_a_refinement_can_be_enough(cp3, cp3_data, tmp_path):
+    config = dataclasses.replace(TINY, refine=True, enough=np.inf)
+    run = RunFolder.create(tmp_path / "run", {})
+    system, report = learn(cp3, cp3_data, config, run=run, progress=False)
+    run.close()
+    assert (report.epochs, report.stopped_early, report.refined) == (2, True, True)
+    assert report.val_loss == run.metrics()[-1]["val_loss"]
+    again = RunFolder.open(tmp_path / "run")
+    resumed, report = learn(cp3, cp3_data, config, run=again, progress=False)
+    again.close()
+    assert (report.epochs, report.stopped_early, report.refined) == (2, True, True)
+    assert np.array_equal(numbers(resumed), numbers(system))
+
+
 def test_early_stopping_keeps_the_best(cp3, cp3_data):
     config = dataclasses.replace(TINY, epochs=40, patience=2, learning_rate=0.5)
     _, report = learn(cp3, cp3_data, config, progress=False)

@@ -52,6 +52,8 @@ class LearnConfig:
     refine: bool = True
     """Refine masses, contact properties and the potential's linear weights by Gauss-Newton steps, on the way and at the
     end; the result is kept if it validates better. For systems of up to 40 points, not for baselines."""
+    enough: float = 1e-4
+    """Stop after the first refinement if the validation loss is then below this share of the data's speed."""
     width: int = 256
     """Units in a hidden layer of the potential, and of the contact network of mlp-cd-clnn."""
     depth: int = 3
@@ -93,6 +95,7 @@ class LearnConfig:
         require(0 <= self.contact_share <= 1, f"contact_share must be in [0, 1]; it was {self.contact_share}.")
         for name in ("learning_rate", "property_learning_rate"):
             require(getattr(self, name) > 0, f"{name} must be positive; it was {getattr(self, name)}.")
+        require(self.enough >= 0, f"enough must not be negative; it was {self.enough}.")
         require(self.loss_width >= 0, f"loss_width must not be negative; it was {self.loss_width}.")
         require(self.weight_decay >= 0, f"weight_decay must not be negative; it was {self.weight_decay}.")
         check_compensation_steps(self.compensation_steps)

@@ -43,7 +43,7 @@ class LearnReport:
     skipped_steps: int
     overflowed_contacts: int
     refined: bool
-    """Whether the refinement at the end (see `LearnConfig.refine`) validated better, and is what was kept."""
+    """Whether what was kept is what a refinement ended with (see `LearnConfig.refine`)."""
     epsilon: float | None = None
     """Of the contact model CMr."""
 
@@ -110,7 +110,7 @@ def initial_baseline(skeleton: System, config: LearnConfig) -> ContactModel | St
 REFINE_AFTER = 0.4
 """Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
 
-The network goes on learning from there with the right masses, which it cannot tell from its own errors.
+If that is not enough, the network goes on learning with the right masses, which it cannot tell from its own errors.
 """
 LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
@@ -315,6 +315,11 @@ def learn(
     loss = jnp.asarray(last["loss"])
     stopped = False
     refines = config.refine and can_be_refined(state.unknowns, trained)
+    refine_at = round(REFINE_AFTER * config.epochs)
+
+    def is_enough(state: TrainState) -> bool:
+        just_refined = bool(state.settled) and int(state.best_epoch) == refine_at
+        return just_refined and float(state.best_loss) <= config.enough * speed
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
         """Unknowns that validate better than these, and how well they do."""
@@ -326,9 +331,12 @@ def learn(
 
     with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
+            if is_enough(state):
+                stopped = True
+                break
             state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
             val_loss = validate(state.unknowns, trained, *held_out, stepper)
-            if refines and epoch == round(REFINE_AFTER * config.epochs):
+            if refines and epoch == refine_at:
                 better = refined(state.unknowns, float(val_loss))
                 if better is not None:
                     unknowns, val_loss = better
@@ -350,7 +358,7 @@ def learn(
             }
             if run is not None:
                 run.log(metrics)
-                if epoch % config.checkpoint_every == 0 or epoch == config.epochs:
+                if epoch % config.checkpoint_every == 0 or epoch in (refine_at, config.epochs):
                     run.save_checkpoint(epoch, state)
             if shown is not None:
                 shown.update(metrics)
@@ -362,8 +370,8 @@ def learn(
             if epoch - int(state.best_epoch) >= config.patience:
                 stopped = True
                 break
-        best, val_loss = state.best, float(state.best_loss)
-        better = refined(best, val_loss) if refines else None
+        best, val_loss, has_refined = state.best, float(state.best_loss), is_enough(state)
+        better = refined(best, val_loss) if refines and not has_refined else None
         best, val_loss = (best, val_loss) if better is None else better
     system = best.assemble(skeleton)
     report = LearnReport(
@@ -375,7 +383,7 @@ def learn(
         stopped_early=stopped,
         skipped_steps=int(state.skipped),
         overflowed_contacts=int(state.overflow),
-        refined=better is not None,
+        refined=has_refined or better is not None,
     )
     return system, report
 
