@@ -424,13 +424,13 @@ def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
     if quantity.truth is None:
         _empty(axes, "the truth is not known")
         return
-    error = _error(quantity.learned, quantity)
+    error = _error(quantity.learned, quantity.truth, relative=quantity.relative)
     known = np.isfinite(error)
     if not known.any():
         _empty(axes, "none was recorded")
         return
     mean = np.where(known, error, 0).sum(axis=1) / np.where(known.any(axis=1), known.sum(axis=1), np.nan)
-    kept = None if quantity.kept is None else _error(quantity.kept[None], quantity)[0]
+    kept = None if quantity.kept is None else _error(quantity.kept[None], quantity.truth, relative=quantity.relative)[0]
     seen = error[known] if kept is None else np.concatenate([error[known], kept[np.isfinite(kept)]])
     positive = seen[seen > 0]
     floor = 10 ** (np.floor(np.log10(positive.min())) - 0.5) if positive.size else 1e-10
@@ -452,11 +452,11 @@ def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
     axes.set_title(f"{which} {power(float(last))}", fontsize=8, color=MUTED, loc="right")
 
 
-def _error(values: np.ndarray, quantity: _Quantity) -> np.ndarray:
+def _error(values: np.ndarray, truth: np.ndarray, *, relative: bool) -> np.ndarray:
     """Distance (rows, values) from the truth, relative for mass ratios."""
-    error = np.abs(values - quantity.truth)
+    error = np.abs(values - truth)
     # The first mass is the unit: it has no error of its own.
-    return error[:, 1:] / np.abs(quantity.truth[1:]) if quantity.relative else error
+    return error[:, 1:] / np.abs(truth[1:]) if relative else error
 
 
 def _name_lines(axes: Axes, quantity: _Quantity) -> None:
