@@ -17,7 +17,7 @@ import carom
 from carom.learning.dataset import Chunks, closed_contacts
 from carom.learning.optimizer import Rates
 from carom.learning.train import fresh_state, gather_chunks, train_step
-from carom.simulation.rollout import Stepper
+from carom.simulation.impact import Stepper
 
 CONFIG = carom.LearnConfig()
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
@@ -210,9 +210,9 @@ class System(eqx.Module):
         """Gaps (m) and Jacobians of all contacts that could be."""
         return all_candidates(self.contacts, x, self.radii, self.table)
 
-    def active(self, x: Float[Array, "n d"]) -> Active:
-        """The closed contacts at `x`, deepest first, padded to `max_active`."""
-        return active_set(self.candidates(x), self._property_index(), self.max_active, self.n_points)
+    def active(self, x: Float[Array, "n d"], closed: Bool[Array, " C"] | None = None) -> Active:
+        """The closed contacts at `x`, deepest first, padded to `max_active`; `closed`: if not by their gaps, which."""
+        return active_set(self.candidates(x), self._property_index(), self.max_active, self.n_points, closed)
 
     def gaps(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t C"]:
         """Gap (m) of every candidate; negative where closed."""

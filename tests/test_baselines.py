@@ -26,7 +26,8 @@ from carom.learning.baselines.graph import WORLD, Graph
 from carom.learning.dataset import Chunks, Dataset
 from carom.learning.optimizer import Rates
 from carom.learning.train import fresh_state, learn, train_step
-from carom.simulation.rollout import Stepper, contact_jump, step
+from carom.simulation.impact import Stepper, contact_jump
+from carom.simulation.rollout import step
 
 NARROW = {"relation_width": 16, "object_width": 16}
 SMALL = {"mlp-cd-clnn": {"width": 16, "depth": 2}, "in-cp-clnn": NARROW, "in-cp-sp": NARROW}

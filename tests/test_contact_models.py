@@ -18,7 +18,8 @@ from carom.learning.model_file import read_model_header
 from carom.learning.optimizer import Rates
 from carom.learning.run import RunFolder
 from carom.learning.train import fresh_state, learn, train_step
-from carom.simulation.rollout import Stepper, simulate
+from carom.simulation.impact import Stepper
+from carom.simulation.rollout import simulate
 
 TINY = carom.LearnConfig(
     epochs=2, chunks_per_epoch=16, batch_size=16, chunk_length=3, width=8, depth=1, checkpoint_every=1, refine=False

@@ -14,7 +14,8 @@ from carom.learning.dataset import recording_of
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import MODEL, RunFolder
 from carom.simulation.files import load_recording, save_recording
-from carom.simulation.rollout import COMPENSATION_STEPS, simulate
+from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.rollout import simulate
 from carom.tasks import find_task, sample
 
 

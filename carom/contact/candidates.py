@@ -262,13 +262,20 @@ class Active(NamedTuple):
     overflow: Int[Array, ""]
 
 
-def active_set(candidates: Candidates, property_index: Int[np.ndarray, " C"], max_active: int, n_points: int) -> Active:
-    """Choose the closed contacts (`gap < 0`), deepest first; Jacobian rows of the others are zero.
+def active_set(
+    candidates: Candidates,
+    property_index: Int[np.ndarray, " C"],
+    max_active: int,
+    n_points: int,
+    closed: Bool[Array, " C"] | None = None,
+) -> Active:
+    """Choose the closed contacts (by default, `gap < 0`), deepest first; Jacobian rows of the others are zero.
 
     Only the chosen contacts get a full Jacobian: candidates may be many.
     """
-    closed = candidates.gap < 0
-    order = jnp.argsort(candidates.gap)[:max_active]
+    by_gap = candidates.gap if closed is None else jnp.where(closed, candidates.gap, jnp.inf)
+    closed = candidates.gap < 0 if closed is None else closed
+    order = jnp.argsort(by_gap)[:max_active]
     active = closed[order]
     rows = jnp.where(active[:, None, None, None], candidates.rows[order], 0)
     points = jax.nn.one_hot(jnp.asarray(candidates.stencil)[order], n_points, dtype=rows.dtype)

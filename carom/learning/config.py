@@ -7,7 +7,7 @@ from carom.checks import require
 from carom.contact.impulses import CMr, contact_model_name, contact_model_of
 from carom.learning.baselines import BASELINES, Baseline
 from carom.mechanics.dynamics import Formulation
-from carom.simulation.rollout import COMPENSATION_STEPS, check_compensation_steps
+from carom.simulation.impact import COMPENSATION_STEPS, check_compensation_steps
 from carom.system import System
 
 Model = Literal["clnn", "chnn"] | Baseline

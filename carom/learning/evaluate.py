@@ -11,7 +11,8 @@ from carom.learning.baselines import physical_quantities
 from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
-from carom.simulation.rollout import COMPENSATION_STEPS, Trajectory, simulate
+from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.rollout import Trajectory, simulate
 from carom.system import System
 
 

@@ -38,7 +38,7 @@ from carom.learning.robust import Solution
 from carom.learning.sensitivity import StepSensitivity
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
-from carom.simulation.rollout import COMPENSATION_STEPS, Stepper
+from carom.simulation.impact import COMPENSATION_STEPS, Stepper
 from carom.system import System
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified"]

@@ -16,7 +16,7 @@ from carom.contact.impulses import CONTACT_MODELS, ContactModel, contact_model_n
 from carom.errors import CaromError
 from carom.learning.baselines import describe_baseline, rebuild_baseline
 from carom.learning.models import NeuralPotential
-from carom.simulation.rollout import COMPENSATION_STEPS
+from carom.simulation.impact import COMPENSATION_STEPS
 from carom.system import System
 
 MAGIC = b"carom model 1\n"

@@ -19,7 +19,7 @@ from carom.learning.models import NeuralPotential, Unknowns
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.sensitivity import StepSensitivity, force_features, step_sensitivity
 from carom.simulation.files import Recording
-from carom.simulation.rollout import Stepper
+from carom.simulation.impact import Stepper
 from carom.system import System
 
 MOST_POINTS = 40

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from carom.contact.impulses import Jump
 from carom.learning.models import NeuralPotential, Unknowns
-from carom.simulation.rollout import Stepper, contact_jump, step
+from carom.simulation.impact import Stepper, contact_jump
+from carom.simulation.rollout import step
 from carom.system import System
 
 

@@ -24,7 +24,8 @@ from carom.learning.progress import TrainingProgress
 from carom.learning.refine import can_be_refined, polish
 from carom.learning.run import RunFolder
 from carom.simulation.files import Recording
-from carom.simulation.rollout import Stepper, step
+from carom.simulation.impact import Stepper
+from carom.simulation.rollout import step
 from carom.system import StepModel, System
 
 

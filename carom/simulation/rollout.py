@@ -1,7 +1,5 @@
 """One time step, and many: `step`, `simulate` and the `Trajectory` they give."""
 
-from typing import Literal
-
 import diffrax
 import equinox as eqx
 import jax
@@ -10,25 +8,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import as_floats, is_known, require, require_values
-from carom.contact.candidates import Active
-from carom.contact.impulses import ContactModel, ContactState, Jump, consistent_velocity, target_velocity
-from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
-from carom.simulation.integrators import RK4, flow
-from carom.simulation.projection import project_state
+from carom.contact.impulses import ContactModel
+from carom.mechanics.dynamics import FIELDS, Formulation
+from carom.simulation.events import step_with_events
+from carom.simulation.impact import (
+    COMPENSATION_STEPS,
+    IMPACT_RULES,
+    ImpactRule,
+    Stepper,
+    StepResult,
+    check_compensation_steps,
+    impact_at,
+    smooth_flow,
+)
+from carom.simulation.integrators import RK4
 from carom.system import System
-
-ImpactRule = Literal["step"]
-
-COMPENSATION_STEPS = 8.0
-"""Time steps over which a penetration is undone, by default (paper, appendix G)."""
-
-
-def check_compensation_steps(steps: float | None) -> None:
-    """Raise `CaromError` unless `steps` is a positive number, or `None` for no compensation."""
-    require(
-        steps is None or 0 < steps < np.inf,
-        f"compensation_steps must be a positive number, or None for no compensation; it was {steps}.",
-    )
 
 
 class Trajectory(eqx.Module):
@@ -47,40 +41,10 @@ class Trajectory(eqx.Module):
     residual: Float[Array, "*b time"]
 
 
-def _as_steps(steps) -> Float[Array, ""] | None:
-    return None if steps is None else jnp.asarray(steps, float)
-
-
-class Stepper(eqx.Module):
-    """How to step: everything but the system and its state.
-
-    `consistent` matters where states are not projected: a violation of the joints then does not enter contacts whose
-    impulses are not unique (see `consistent_velocity`). The paper's simulator lets it, which gives jumps that hang on
-    the drift, and derivatives that training cannot use.
-    """
-
-    dt: Float[Array, ""]
-    formulation: Formulation = eqx.field(static=True, default="lagrangian")
-    solver: diffrax.AbstractSolver = eqx.field(default_factory=RK4)
-    project: bool = eqx.field(static=True, default=True)
-    compensation_steps: Float[Array, ""] | None = eqx.field(default=COMPENSATION_STEPS, converter=_as_steps)
-    smoothing: float = eqx.field(static=True, default=0.0)
-    contact: bool = eqx.field(static=True, default=True)
-    consistent: bool = eqx.field(static=True, default=False)
-
-
-class StepResult(eqx.Module):
-    """State after a step, whether a contact was closed, and how the contact solver fared."""
-
-    x: Float[Array, "n d"]
-    v: Float[Array, "n d"]
-    contact: Bool[Array, ""]
-    overflow: Int[Array, ""]
-    residual: Float[Array, ""]
-
-
 def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None) -> StepResult:
     """Integrate one whole step, then let the contacts act that are closed at its end (the paper's rule).
+
+    With events, cut the step at the times at which contacts close (see `carom.simulation.events`).
 
     A system with a `step_model` is moved by that alone.
     """
@@ -90,80 +54,13 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
         closed = jnp.any(system.gaps(x) < 0)
         return StepResult(x, v, closed, overflow=jnp.asarray(0), residual=jnp.zeros((), x.dtype))
     inverse_mass = system.inverse_mass_matrix()
-    field = FIELDS[stepper.formulation]
-
-    def rate(state):
-        x, v = state
-        total = -jax.grad(system.potential_energy)(x)
-        if force is not None:
-            total = total + force
-        return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
-
-    x, v = flow(stepper.solver, rate, (x, v), stepper.dt)
-    if stepper.project:
-        x, v = project_state(system.constraints, x, v, inverse_mass)
+    rate, after = smooth_flow(system, stepper, inverse_mass, force)
     if not stepper.contact or not system.contacts:
+        x, v = after((x, v), stepper.dt)
         return StepResult(x, v, jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
-    return impact(system, x, v, inverse_mass, stepper)
-
-
-def contact_jump(
-    system: System,
-    x: Float[Array, "n d"],
-    v: Float[Array, "n d"],
-    inverse_mass: Float[Array, "n n"],
-    stepper: Stepper,
-) -> tuple[Active, Jump]:
-    """The contacts that are closed at `x`, and how they change the velocity (S.8 to S.15)."""
-    active = system.active(x)
-    k, d = active.jacobian.shape[:2]
-    rows = active.jacobian.reshape(k * d, system.n_points, d)
-    response = jnp.einsum("ij,rjd->rid", inverse_mass, rows)  # M^-1 J_C^T
-    saddle = SaddlePoint(jax.jacrev(system.constraints)(x), inverse_mass) if system.links else None
-    if saddle is not None:
-        response = saddle.project(response)
-    delassus = jnp.einsum("rid,sid->rs", rows, response)
-    delassus = (delassus + delassus.T) / 2
-    velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
-    friction = system.friction[active.property_index]
-    if saddle is not None and stepper.consistent and not stepper.project:
-        drift = jnp.einsum("rid,id->r", rows, v - saddle.project(v[None])[0]).reshape(k, d)
-        velocity = consistent_velocity(velocity, drift, delassus, friction)
-    v_star = jnp.zeros_like(velocity)
-    if stepper.compensation_steps is not None:
-        joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
-        depth = jnp.where(active.active, -active.gap, 0)
-        time = stepper.dt * stepper.compensation_steps.astype(stepper.dt.dtype)
-        v_star = target_velocity(active.jacobian, depth, joints, time=time)
-    jump = system.contact_model(
-        ContactState(
-            x=x,
-            v=v,
-            active=active,
-            response=response,
-            delassus=delassus,
-            velocity=velocity,
-            target=v_star,
-            friction=friction,
-            restitution=system.restitution[active.property_index],
-        ),
-        smoothing=stepper.smoothing,
-    )
-    return active, jump
-
-
-def impact(
-    system: System,
-    x: Float[Array, "n d"],
-    v: Float[Array, "n d"],
-    inverse_mass: Float[Array, "n n"],
-    stepper: Stepper,
-) -> StepResult:
-    """Let the contacts that are closed at `x` change the velocity."""
-    active, jump = contact_jump(system, x, v, inverse_mass, stepper)
-    return StepResult(
-        x=x, v=v + jump.velocity, contact=jnp.any(active.active), overflow=active.overflow, residual=jump.residual
-    )
+    if stepper.impact == "event":
+        return step_with_events(system, x, v, inverse_mass, stepper, (rate, after))
+    return impact_at(system, *after((x, v), stepper.dt), inverse_mass, stepper)
 
 
 def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) -> Trajectory:
@@ -206,6 +103,7 @@ def simulate(
     dt: float,
     steps: int,
     impact: ImpactRule = "step",
+    max_events: int = 2,
     project: bool = True,
     force: Float[Array, "*b steps n d"] | None = None,
     formulation: Formulation = "lagrangian",
@@ -221,7 +119,9 @@ def simulate(
 
     - `x0`, `v0`: (n, d) or (N, n, d), positions (m) and velocities (m/s) of the points.
     - `dt`, `steps`: time step (s) and number of steps.
-    - `impact`: `"step"` integrates a whole step and lets the contacts act that are closed at its end.
+    - `impact`: `"step"` integrates a whole step and lets the contacts act that are closed at its end. `"event"` cuts
+      the step at the times at which contacts close and lets them act there: derivatives through impacts are right then.
+    - `max_events`: most times at which a step is cut; what comes after is left to the rule of `"step"`.
     - `project`: bring each step's end back onto the constraints.
     - `force`: (steps, n, d) or (N, steps, n, d) in N, held over each step, added to the generalised force.
     - `formulation`: `"lagrangian"` or `"hamiltonian"`; the same motion.
@@ -238,7 +138,11 @@ def simulate(
     if contact_model is not None:
         system = system.with_contact_model(contact_model)
     x0, v0 = as_floats(x0), as_floats(v0)
-    require(impact == "step", f'impact must be "step"; it was {impact!r}.')
+    require(impact in IMPACT_RULES, f"impact must be one of {sorted(IMPACT_RULES)}; it was {impact!r}.")
+    require(
+        isinstance(max_events, int | np.integer) and max_events > 0,
+        f"max_events must be a positive whole number; it was {max_events}.",
+    )
     require(formulation in FIELDS, f"formulation must be one of {sorted(FIELDS)}; it was {formulation!r}.")
     require(
         isinstance(steps, int | np.integer) and steps > 0, f"steps must be a positive whole number; it was {steps}."
@@ -259,6 +163,8 @@ def simulate(
         project=project,
         compensation_steps=compensation_steps,
         smoothing=smoothing,
+        impact=impact,
+        events=int(max_events),
     )
     out = _simulate(system, x0, v0, stepper, int(steps), force)
     if throw:

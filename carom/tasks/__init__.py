@@ -14,7 +14,8 @@ from carom.contact.impulses import ContactModel, contact_model_name
 from carom.learning.dataset import recording_of
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.simulation.files import Recording
-from carom.simulation.rollout import COMPENSATION_STEPS, simulate
+from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.rollout import simulate
 from carom.system import System
 from carom.tasks.base import Task as Task
 from carom.tasks.bouncing import BP5, BP5_E

@@ -1,0 +1,149 @@
+"""How contacts change the velocity at one time, and what says how to step."""
+
+from typing import Literal, get_args
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from carom.checks import require
+from carom.contact.candidates import Active
+from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
+from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
+from carom.simulation.integrators import RK4, flow
+from carom.simulation.projection import project_state
+from carom.system import System
+
+ImpactRule = Literal["step", "event"]
+"""When contacts act: at the end of a step in which they close, or at the time at which they do."""
+IMPACT_RULES = get_args(ImpactRule)
+
+COMPENSATION_STEPS = 8.0
+"""Time steps over which a penetration is undone, by default (paper, appendix G)."""
+
+
+def check_compensation_steps(steps: float | None) -> None:
+    """Raise `CaromError` unless `steps` is a positive number, or `None` for no compensation."""
+    require(
+        steps is None or 0 < steps < np.inf,
+        f"compensation_steps must be a positive number, or None for no compensation; it was {steps}.",
+    )
+
+
+def _as_steps(steps) -> Float[Array, ""] | None:
+    return None if steps is None else jnp.asarray(steps, float)
+
+
+class Stepper(eqx.Module):
+    """How to step: everything but the system and its state.
+
+    `consistent` matters where states are not projected: a violation of the joints then does not enter contacts whose
+    impulses are not unique (see `consistent_velocity`). The paper's simulator lets it, which gives jumps that hang on
+    the drift, and derivatives that training cannot use.
+    """
+
+    dt: Float[Array, ""]
+    formulation: Formulation = eqx.field(static=True, default="lagrangian")
+    solver: diffrax.AbstractSolver = eqx.field(default_factory=RK4)
+    project: bool = eqx.field(static=True, default=True)
+    compensation_steps: Float[Array, ""] | None = eqx.field(default=COMPENSATION_STEPS, converter=_as_steps)
+    smoothing: float = eqx.field(static=True, default=0.0)
+    contact: bool = eqx.field(static=True, default=True)
+    consistent: bool = eqx.field(static=True, default=False)
+    impact: ImpactRule = eqx.field(static=True, default="step")
+    events: int = eqx.field(static=True, default=2)  # most impacts that a step is cut at, where `impact` is "event"
+
+
+class StepResult(eqx.Module):
+    """State after a step, whether a contact was closed, and how the contact solver fared."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    contact: Bool[Array, ""]
+    overflow: Int[Array, ""]
+    residual: Float[Array, ""]
+
+
+def smooth_flow(system: System, stepper: Stepper, inverse_mass: Float[Array, "n n"], force=None):
+    """The motion between impacts, as two functions of a state `(x, v)`: its rate, and the state after a time (s)."""
+    field = FIELDS[stepper.formulation]
+
+    def rate(state):
+        x, v = state
+        total = -jax.grad(system.potential_energy)(x)
+        if force is not None:
+            total = total + force
+        return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
+
+    def after(state, time):
+        x, v = flow(stepper.solver, rate, state, time)
+        return project_state(system.constraints, x, v, inverse_mass) if stepper.project else (x, v)
+
+    return rate, after
+
+
+def contact_jump(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+    closed: Bool[Array, " C"] | None = None,
+) -> tuple[Active, Jump]:
+    """The contacts that are closed at `x`, and how they change the velocity (S.8 to S.15).
+
+    `closed`: which these are, if not those whose gap is negative.
+    """
+    active = system.active(x, closed)
+    k, d = active.jacobian.shape[:2]
+    rows = active.jacobian.reshape(k * d, system.n_points, d)
+    response = jnp.einsum("ij,rjd->rid", inverse_mass, rows)  # M^-1 J_C^T
+    saddle = SaddlePoint(jax.jacrev(system.constraints)(x), inverse_mass) if system.links else None
+    if saddle is not None:
+        response = saddle.project(response)
+    delassus = jnp.einsum("rid,sid->rs", rows, response)
+    delassus = (delassus + delassus.T) / 2
+    velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
+    friction = system.friction[active.property_index]
+    if saddle is not None and stepper.consistent and not stepper.project:
+        drift = jnp.einsum("rid,id->r", rows, v - saddle.project(v[None])[0]).reshape(k, d)
+        velocity = consistent_velocity(velocity, drift, delassus, friction)
+    v_star = jnp.zeros_like(velocity)
+    if stepper.compensation_steps is not None:
+        joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
+        depth = jnp.where(active.active, jnp.maximum(-active.gap, 0), 0)
+        time = stepper.dt * stepper.compensation_steps.astype(stepper.dt.dtype)
+        v_star = target_velocity(active.jacobian, depth, joints, time=time)
+    jump = system.contact_model(
+        ContactState(
+            x=x,
+            v=v,
+            active=active,
+            response=response,
+            delassus=delassus,
+            velocity=velocity,
+            target=v_star,
+            friction=friction,
+            restitution=system.restitution[active.property_index],
+        ),
+        smoothing=stepper.smoothing,
+    )
+    return active, jump
+
+
+def impact_at(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+    closed: Bool[Array, " C"] | None = None,
+) -> StepResult:
+    """Let the contacts that are closed at `x` change the velocity. For `closed` see `contact_jump`."""
+    active, jump = contact_jump(system, x, v, inverse_mass, stepper, closed)
+    return StepResult(
+        x=x, v=v + jump.velocity, contact=jnp.any(active.active), overflow=active.overflow, residual=jump.residual
+    )

@@ -1,0 +1,357 @@
+"""Impacts at the time at which they happen, against closed forms: motion, and derivatives by all that is given."""
+
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import GRAVITY, refused
+
+import carom
+from carom.mechanics.bodies import embed_pose, embed_velocity
+from carom.mechanics.dynamics import saddle_point
+
+RADIUS = 0.1
+TIME = 1.0
+STEPS = 20
+"""Coarse steps: how near to a closed form one comes must not hang on them."""
+
+
+class Given(eqx.Module):
+    """All that the end of a motion depends on."""
+
+    x: jax.Array
+    v: jax.Array
+    force: jax.Array  # N, constant
+    friction: jax.Array
+    restitution: jax.Array
+
+
+@dataclasses.dataclass
+class Case:
+    """Balls of radius 0.1 m that meet planes and each other in turn: `("plane", ball, which)`, `("pair", a, b)`."""
+
+    x: list
+    v: list
+    meets: list
+    planes: tuple = ()
+    friction: float = 0.0
+    restitution: float = 0.8
+    gravity: float = GRAVITY
+    masses: tuple = (1.3,)
+    model: str = "cm"
+
+    def given(self):
+        x = jnp.array(self.x)
+        force = jnp.zeros_like(x).at[:, 0].set(0.05)
+        return Given(x, jnp.array(self.v), force, jnp.array([self.friction]), jnp.array([self.restitution]))
+
+    def system(self):
+        pairs = list(itertools.combinations(range(len(self.masses)), 2))
+        balls = range(len(self.masses))
+        return carom.System(
+            bodies=[carom.PointMass(m, RADIUS) for m in self.masses],
+            contacts=[*([carom.DiskDisk(pairs)] if pairs else []), *(carom.DiskPlane(balls, *p) for p in self.planes)],
+            potential=carom.Gravity((0.0, -self.gravity)),
+            friction=self.friction,
+            restitution=self.restitution,
+            contact_model=self.model,
+        )
+
+    def end(self, given: Given):
+        """State at the end: parabolas, with the law of the contact model where balls meet."""
+        masses = jnp.array(self.masses)[:, None]
+        acceleration = given.force / masses + jnp.array([0.0, -self.gravity])
+        x, v, left = given.x, given.v, jnp.asarray(TIME)
+        for meet in self.meets:
+            t = self._time(meet, x, v, acceleration)
+            x, v, left = x + v * t + acceleration * t**2 / 2, v + acceleration * t, left - t
+            v = self._after(meet, x, v, given)
+        return x + v * left + acceleration * left**2 / 2, v + acceleration * left
+
+    def _gap(self, meet, x):
+        kind, a, b = meet
+        if kind == "plane":
+            point, normal = (jnp.array(part) for part in self.planes[b])
+            return (x[a] - point) @ normal - RADIUS, normal
+        apart = x[a] - x[b]
+        return jnp.linalg.norm(apart) - 2 * RADIUS, apart / jnp.linalg.norm(apart)
+
+    def _time(self, meet, x, v, acceleration):
+        def gap(t):
+            return self._gap(meet, x + v * t + acceleration * t**2 / 2)[0]
+
+        times = np.linspace(1e-6, TIME, 2001)
+        values = np.asarray(jax.lax.stop_gradient(jax.vmap(gap)(times)))
+        t = jnp.asarray(times[np.argmax((values[1:] < 0) & (values[:-1] >= 0))])
+        for _ in range(6):
+            t = t - gap(t) / jax.grad(gap)(t)
+        return t
+
+    def _after(self, meet, x, v, given):
+        kind, a, b = meet
+        _, normal = self._gap(meet, x)
+        relative = v[a] - (v[b] if kind == "pair" else 0)
+        mass = self.masses[a] if kind == "plane" else 1 / (1 / self.masses[a] + 1 / self.masses[b])
+        speed = relative @ normal
+        sliding = relative - speed * normal
+        slip = jnp.linalg.norm(sliding) if self.friction else 1.0
+        friction = given.friction[0]
+        # Both phases of CM while the contact slides: the point of the cone's edge with the least energy (eq. 5).
+        compression = (friction * slip - speed) / (1 + friction**2) if self.model == "cm" else -speed
+        kick = mass * (1 + given.restitution[0]) * compression * (normal - friction * sliding / slip)
+        v = v.at[a].add(kick / self.masses[a])
+        return v.at[b].add(-kick / self.masses[b]) if kind == "pair" else v
+
+
+FLOOR, WALL = ((0.0, 0.0), (0.0, 1.0)), ((1.75, 0.0), (-1.0, 0.0))
+CASES = {
+    "one bounce": Case([[0.0, 0.6]], [[0.2, 0.3]], [("plane", 0, 0)], (FLOOR,), restitution=0.9, gravity=3.0),
+    "three bounces": Case([[0.0, 0.3]], [[0.2, 0.3]], [("plane", 0, 0)] * 3, (FLOOR,), restitution=0.85),
+    "ground, then wall": Case(
+        [[0.3, 0.6]], [[2.0, -2.0]], [("plane", 0, 0), ("plane", 0, 1)], (FLOOR, WALL), gravity=3.0
+    ),
+    "oblique, sliding": Case([[0.0, 0.5]], [[3.0, -1.0]], [("plane", 0, 0)], (FLOOR,), 0.2, gravity=3.0),
+    "the same with LCP": Case([[0.0, 0.5]], [[3.0, -1.0]], [("plane", 0, 0)], (FLOOR,), 0.2, gravity=3.0, model="lcp"),
+    "head-on": Case(
+        [[0.0, 0.0], [0.5, 0.0]],
+        [[1.0, 0.0], [0.0, 0.0]],
+        [("pair", 0, 1)],
+        restitution=1.0,
+        gravity=0.0,
+        masses=(1.0, 1.0),
+    ),
+    "chain of three": Case(
+        [[0.0, 0.0], [0.4, 0.02], [0.9, 0.0]],
+        [[1.5, 0.1], [0.0, 0.0], [-0.1, 0.0]],
+        [("pair", 0, 1), ("pair", 1, 2)],
+        gravity=0.0,
+        masses=(0.7, 1.0, 0.4),
+        restitution=0.9,
+    ),
+}
+
+
+def at_end(system, given: Given, dt, steps: int, impact="event", **options):
+    changed = eqx.tree_at(lambda s: (s.friction, s.restitution), system, (given.friction, given.restitution))
+    force = jnp.broadcast_to(given.force, (steps, *given.x.shape))
+    out = carom.simulate(changed, given.x, given.v, dt=dt, steps=steps, impact=impact, force=force, **options)
+    return out.x[-1], out.v[-1]
+
+
+@eqx.filter_jit
+def rows_of(system, given, dt, steps):
+    """The end of a motion, and its derivatives by all that is given, in reverse mode."""
+    flat = lambda given: jnp.concatenate([part.ravel() for part in at_end(system, given, dt, steps)])  # noqa: E731
+    return flat(given), jax.jacrev(flat)(given)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_end_and_its_derivatives_are_those_of_the_closed_form(name):
+    case = CASES[name]
+    given = case.given()
+    end, slopes = rows_of(case.system(), given, TIME / STEPS, STEPS)
+
+    def exact(given):
+        return jnp.concatenate([part.ravel() for part in case.end(given)])
+
+    assert np.allclose(end, exact(given), atol=1e-9)
+    for part in ("x", "v", "force", "restitution", "friction" if case.friction else "x"):
+        found, wanted = getattr(slopes, part), getattr(jax.jacrev(exact)(given), part)
+        error = np.abs(found - wanted).max() / np.abs(wanted).max()
+        assert error < 1e-6, f"{part}: {error:.1e}"
+
+
+def test_a_compound_pendulum_hits_a_wall():
+    """A disk on a massless arm turns about the origin, without gravity, and rebounds from a wall (eq. of its angle)."""
+    arm, radius, wall, start, rate, restitution, time = 0.8, 0.15, 0.5, 0.1, 0.7, 0.6, 1.0
+    system = carom.System(
+        bodies=[carom.RigidBody(0.4, (0.01, 0.02), radius)],
+        constraints=[carom.Joint(0, (1 + arm, 0.0, -arm), (0.0, 0.0))],
+        contacts=[carom.DiskPlane([0], (wall, 0.0), (-1.0, 0.0))],
+        friction=0.0,
+        restitution=restitution,
+        dim=2,
+    )
+
+    def exact(angle, rate, restitution):
+        met = jnp.arcsin((wall - radius) / arm)
+        return met - restitution * rate * (time - (met - angle) / rate)
+
+    def simulated(angle, rate, restitution):
+        # The body's second axis points along the arm, which hangs at `angle` from it.
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        rotation = jnp.array([[c, s], [-s, c]])[None]
+        center = arm * rotation[:, :, 1]
+        velocity = rate * arm * jnp.array([[c, -s]])
+        x0, v0 = embed_pose(center, rotation)[0], embed_velocity(rotation, velocity, -rate * jnp.ones((1, 1)))[0]
+        changed = eqx.tree_at(lambda s: s.restitution, system, restitution[None])
+        x = carom.simulate(changed, x0, v0, dt=time / 50, steps=50, impact="event").x[-1, 0]
+        return jnp.arctan2(x[0], x[1])
+
+    given = tuple(jnp.asarray(value) for value in (start, rate, restitution))
+    found, slopes = jax.jit(jax.value_and_grad(simulated, argnums=(0, 1, 2)))(*given)
+    wanted, wanted_slopes = jax.value_and_grad(exact, argnums=(0, 1, 2))(*given)
+    assert abs(found - wanted) < 1e-8
+    assert np.allclose(slopes, wanted_slopes, rtol=1e-6)
+
+
+def test_bounce_once():
+    """Zhong, Han and Brikis (2022), task 1: elastic, no gravity, 480 steps; with the step's rule the sign is wrong."""
+    system = carom.System(
+        bodies=[carom.PointMass(1.0, RADIUS)],
+        contacts=[carom.DiskPlane([0], *FLOOR)],
+        friction=0.0,
+        restitution=1.0,
+        dim=2,
+    )
+
+    def height(x0, v0, impact):
+        return carom.simulate(system, x0, v0, dt=1 / 480, steps=480, impact=impact).x[-1, 0, 1]
+
+    state = jnp.array([[-1.0, 1.0]]), jnp.array([[2.0, -2.0]])
+    by_place, by_speed = jax.grad(height, argnums=(0, 1))(*state, "event")
+    assert np.allclose(by_place[0], [0, -1], atol=1e-7)
+    assert np.allclose(by_speed[0], [0, -1], atol=1e-7)
+    assert jax.grad(height)(*state, "step")[0, 1] > 0
+
+
+# --- What is not in closed form ------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.parametrize("task", ["cp3-e", "bd5", "gyro"])
+def test_derivatives_are_those_of_differences(task):
+    """Up to the third impact of the first trajectory that has one."""
+    system, dt = carom.task(task), {"gyro": 0.02}.get(task, 0.01)
+    x0, v0 = carom.sample(system, jax.random.key(2), 16)
+    motion = carom.simulate(system, x0, v0, dt=dt, steps=50, impact="event")
+    impacts = np.cumsum(motion.contact, axis=1)
+    k = int(np.argmax(impacts[:, -1] >= 2))
+    steps = int(np.argmax(impacts[k] >= min(3, impacts[k, -1])))
+    x, v = x0[k], v0[k]
+    rng = np.random.default_rng(0)
+    inverse = system.inverse_mass_matrix()
+    if system.links:
+        saddle = saddle_point(system.constraints, x, inverse)
+        towards = saddle.project(jnp.asarray(rng.normal(size=(1, *x.shape))))[0]
+    else:
+        towards = jnp.asarray(rng.normal(size=x.shape))
+    weights = jnp.asarray(rng.normal(size=(2, *x.shape)))
+
+    @jax.jit
+    def loss(change):
+        out = carom.simulate(system, x, v + change * towards, dt=dt, steps=50, impact="event")
+        return jnp.sum(weights * jnp.stack([out.x[steps], out.v[steps]]))
+
+    slope = jax.jit(jax.grad(loss))(0.0)
+    step = 1e-6
+    difference = (loss(step) - loss(-step)) / (2 * step)
+    assert abs(slope - difference) < 1e-4 * abs(difference)
+
+
+def test_forward_equals_reverse_and_a_batch_its_members():
+    case = CASES["oblique, sliding"]
+    system, given = case.system(), case.given()
+
+    def loss(v):
+        x, v = at_end(system, dataclasses.replace(given, v=v), TIME / STEPS, STEPS)
+        return jnp.sum(jnp.sin(x) + jnp.cos(v))
+
+    batch = jnp.stack([given.v, 0.5 * given.v, -given.v])
+    reverse = jax.jit(jax.vmap(jax.grad(loss)))(batch)
+    forward = jax.jit(jax.vmap(jax.jacfwd(loss)))(batch)
+    assert np.allclose(reverse, forward, atol=1e-10)
+    one = jax.jit(jax.grad(loss))
+    assert np.allclose(reverse, np.stack([one(v) for v in batch]), atol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [3.0, 50.0, 500.0])
+def test_fast_bodies_do_not_pass_through_each_other(speed):
+    """Two small balls that would change places within one step meet instead, and exchange velocities."""
+    system = carom.System(
+        bodies=[carom.PointMass(1.0, 0.01)] * 2,
+        contacts=[carom.DiskDisk([(0, 1)])],
+        friction=0.0,
+        restitution=1.0,
+        dim=2,
+    )
+    x0, v0 = jnp.array([[-0.52, 0.0], [0.48, 0.0]]), jnp.array([[speed, 0.0], [-speed, 0.0]])
+    steps = 10
+    out = carom.simulate(system, x0, v0, dt=1 / speed / steps, steps=steps, impact="event")
+    met = 0.98 / (2 * speed)
+    assert np.allclose(out.v[-1], -v0, rtol=1e-6)
+    assert np.allclose(out.x[-1], x0 + v0 * (2 * met - 1 / speed), atol=1e-7)
+    assert np.asarray(system.gaps(out.x)).min() > -1e-9
+
+
+def test_what_rests_or_bounces_ever_faster_is_left_to_the_rule_of_the_step():
+    """A ball that is dropped comes to rest: no hang, no sinking, no energy from nothing (Zeno)."""
+    case = Case([[0.0, 0.2]], [[0.3, 0.0]], [], (FLOOR,), 0.1)
+    for restitution in (0.0, 0.5):
+        given = dataclasses.replace(case.given(), force=jnp.zeros((1, 2)), restitution=jnp.array([restitution]))
+        out = carom.simulate(
+            eqx.tree_at(lambda s: s.restitution, case.system(), given.restitution),
+            given.x, given.v, dt=0.01, steps=200, impact="event",
+        )  # fmt: skip
+        gap = np.asarray(out.x[:, 0, 1]) - RADIUS
+        # A ball rests where compensation, over 8 steps, gives it the speed g dt / 2: 4 g dt^2 deep.
+        assert gap.min() > -4.01 * GRAVITY * 0.01**2
+        assert abs(gap[-1]) < 4.01 * GRAVITY * 0.01**2
+        assert np.abs(out.v[-1, 0, 1]) < 2 * GRAVITY * 0.01
+
+
+def test_impacts_within_one_step():
+    """Three balls in a row, hit twice in a single step: as in many steps, if a step may be cut twice."""
+    case = CASES["chain of three"]
+    system, given = case.system(), case.given()
+    fine = at_end(system, given, TIME / 100, 100)
+    once = at_end(system, given, TIME, 1)
+    assert np.allclose(np.concatenate(once), np.concatenate(fine), atol=1e-9)
+    cut_once = at_end(system, given, TIME, 1, max_events=1)
+    assert not np.allclose(np.concatenate(cut_once), np.concatenate(fine), atol=1e-3)
+
+
+def test_order_of_convergence_through_an_elastic_impact():
+    """A ball on a spring rebounds elastically: with events the integrator keeps its order (4), without it has none.
+
+    Both tend to the same motion: `y = cos(w t)` up to the floor, and the same back.
+    """
+    stiffness, time = 8.0, 1.0
+    system = carom.System(
+        bodies=[carom.PointMass(1.0, RADIUS)],
+        contacts=[carom.DiskPlane([0], *FLOOR)],
+        potential=carom.Springs([0], stiffness, 0.0, anchor=(0.0, 0.0)),
+        friction=0.0,
+        restitution=1.0,
+    )
+    w = (2 * stiffness) ** 0.5
+    met = np.arccos(RADIUS) / w
+    exact = np.cos(w * (2 * met - time))
+
+    def error(steps, impact):
+        out = carom.simulate(
+            system, jnp.array([[0.0, 1.0]]), jnp.zeros((1, 2)), dt=time / steps, steps=steps, impact=impact,
+            compensation_steps=None,
+        )  # fmt: skip
+        return abs(float(out.x[-1, 0, 1]) - exact)
+
+    with_events = np.array([error(steps, "event") for steps in (8, 16, 32)])
+    assert (np.log2(with_events[:-1] / with_events[1:]) > 3.5).all(), with_events
+    assert with_events[-1] < 1e-5
+    by_steps = [error(steps, "step") for steps in (32, 2048)]
+    assert with_events[-1] < 0.01 * by_steps[0]
+    assert by_steps[1] < 4 * w / 2048
+
+
+def test_what_cannot_be_is_refused():
+    case = CASES["one bounce"]
+    system, given = case.system(), case.given()
+    with refused("impact must be one of ['event', 'step']; it was 'never'"):
+        carom.simulate(system, given.x, given.v, dt=0.01, steps=1, impact="never")  # pyright: ignore[reportArgumentType]
+    with refused("max_events must be a positive whole number; it was 0"):
+        carom.simulate(system, given.x, given.v, dt=0.01, steps=1, impact="event", max_events=0)
