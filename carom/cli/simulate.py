@@ -14,7 +14,7 @@ from carom.learning.dataset import recording_of
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import MODEL, RunFolder
 from carom.simulation.files import load_recording, save_recording
-from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.simulation.rollout import simulate
 from carom.tasks import find_task, sample
 
@@ -41,6 +41,8 @@ class Simulate:
     """Seed of the initial states."""
     project: bool = True
     """Bring each step's end back onto the constraints."""
+    impact: ImpactRule = "step"
+    """Contacts act at the end of the step in which they close (step), or at the time at which they close (event)."""
     contact_model: ContactModelName | None = None
     """Contact model; by default that of the learned model, or cm."""
     compensation_steps: CompensationSteps = "auto"
@@ -83,6 +85,7 @@ class Simulate:
             v0,
             dt=chosen.dt if self.dt is None else self.dt,
             steps=chosen.steps if self.steps is None else self.steps,
+            impact=self.impact,
             project=self.project,
             formulation=formulation,
             compensation_steps=compensation if self.compensation_steps == "auto" else self.compensation_steps,
