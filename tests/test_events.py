@@ -13,6 +13,7 @@ from systems import GRAVITY, refused
 import carom
 from carom.mechanics.bodies import embed_pose, embed_velocity
 from carom.mechanics.dynamics import saddle_point
+from carom.tasks import find_task
 
 RADIUS = 0.1
 TIME = 1.0
@@ -207,22 +208,36 @@ def test_a_compound_pendulum_hits_a_wall():
 @pytest.mark.ci_budget
 def test_bounce_once():
     """Zhong, Han and Brikis (2022), task 1: elastic, no gravity, 480 steps; with the step's rule the sign is wrong."""
-    system = carom.System(
-        bodies=[carom.PointMass(1.0, RADIUS)],
-        contacts=[carom.DiskPlane([0], *FLOOR)],
-        friction=0.0,
-        restitution=1.0,
-        dim=2,
-    )
+    task, system = find_task("bounce-once"), carom.task("bounce-once")
 
     def height(x0, v0, impact):
-        return carom.simulate(system, x0, v0, dt=1 / 480, steps=480, impact=impact).x[-1, 0, 1]
+        return carom.simulate(system, x0, v0, dt=task.dt, steps=task.steps, impact=impact).x[-1, 0, 1]
 
     state = jnp.array([[-1.0, 1.0]]), jnp.array([[2.0, -2.0]])
     by_place, by_speed = jax.grad(height, argnums=(0, 1))(*state, "event")
     assert np.allclose(by_place[0], [0, -1], atol=1e-7)
     assert np.allclose(by_speed[0], [0, -1], atol=1e-7)
     assert jax.grad(height)(*state, "step")[0, 1] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_two_balls():
+    """Task 4 of the same: derivatives of its loss by the start, from the analytic solution (to the 6 digits given)."""
+    task, system = find_task("two-balls"), carom.task("two-balls")
+    force = jnp.zeros((task.steps, 2, 2)).at[:, 0].set(3.0)
+
+    @jax.jit
+    def slopes(x0, v0):
+        def loss(x0, v0):
+            out = carom.simulate(system, x0, v0, dt=task.dt, steps=task.steps, impact="event", force=force)
+            return jnp.sum(out.x[-1, 1] ** 2) + 0.1 * jnp.sum(force**2) * task.dt
+
+        return jax.grad(loss, argnums=(0, 1))(x0, v0)
+
+    by_place, by_speed = slopes(jnp.array(task.start), jnp.array(task.velocity))
+    assert np.allclose(by_place, [[-0.398669] * 2, [-0.321253] * 2], atol=1e-4)
+    assert np.allclose(by_speed, [[-0.497791] * 2, [-0.222131] * 2], atol=1e-4)
 
 
 # --- What is not in closed form ------------------------------------------------------------------------------------

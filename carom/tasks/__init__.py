@@ -21,11 +21,12 @@ from carom.tasks.base import Task as Task
 from carom.tasks.bouncing import BP5, BP5_E
 from carom.tasks.disks import BD5, BILLIARDS, THROW
 from carom.tasks.gyroscopes import GYRO, GYRO_E
+from carom.tasks.impacts import BOUNCE_ONCE, GROUND_WALL, TWO_BALLS
 from carom.tasks.pendulums import CP3, CP3_E
 from carom.tasks.ropes import ROPE, ROPE_50, ROPE_100, ROPE_200
 
 _PAPER = (BP5_E, BP5, BD5, CP3, CP3_E, GYRO, GYRO_E, ROPE, ROPE_50, ROPE_100, ROPE_200)
-TASKS: dict[str, Task] = {task.name: task for task in (*_PAPER, BILLIARDS, THROW)}
+TASKS: dict[str, Task] = {task.name: task for task in (*_PAPER, BILLIARDS, THROW, BOUNCE_ONCE, GROUND_WALL, TWO_BALLS)}
 
 
 def find_task(name: str) -> Task:
