@@ -228,6 +228,10 @@ class System(eqx.Module):
             return jnp.zeros(0)
         return jnp.concatenate([contact.reach(self.radii) for contact in self.contacts])
 
+    def travel(self) -> Float[Array, " C"]:
+        """How much points may move while the gap of a candidate changes smoothly; see `Contact.travel`."""
+        return jnp.concatenate([contact.travel(self.radii) for contact in self.contacts])
+
 
 def _dimension(bodies, contacts, potential, dim) -> int:
     """The one dimension that all parts agree on."""

@@ -13,6 +13,7 @@ from systems import GRAVITY, refused
 import carom
 from carom.mechanics.bodies import embed_pose, embed_velocity
 from carom.mechanics.dynamics import saddle_point
+from carom.simulation.events import first_root
 from carom.tasks import find_task
 
 RADIUS = 0.1
@@ -238,6 +239,49 @@ def test_two_balls():
     by_place, by_speed = slopes(jnp.array(task.start), jnp.array(task.velocity))
     assert np.allclose(by_place, [[-0.398669] * 2, [-0.321253] * 2], atol=1e-4)
     assert np.allclose(by_speed, [[-0.497791] * 2, [-0.222131] * 2], atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_geometry_and_impacts_at_the_same_time():
+    """Elastic, no gravity: `y = v T - y_0 + 2 r + 2 h` over a floor at h, for each of two balls that land together."""
+
+    def heights(radius, floor, y0):
+        system = carom.System(
+            bodies=[carom.PointMass(1.0, radius), carom.PointMass(2.0, radius)],
+            contacts=[carom.DiskPlane([0, 1], jnp.stack([jnp.zeros(()), floor]), (0.0, 1.0))],
+            friction=0.0,
+            restitution=1.0,
+            dim=2,
+        )
+        x0 = jnp.stack([jnp.array([0.0, 1.0]), y0], axis=1)
+        v0 = jnp.array([[0.5, -2.0], [0.1, -2.0]])
+        return carom.simulate(system, x0, v0, dt=0.05, steps=20, impact="event").x[-1, :, 1]
+
+    given = jnp.asarray(0.0), jnp.asarray(0.1), jnp.array([0.93, 0.93])  # points: bodies need no radius
+    by_radius, by_floor, by_height = jax.jacrev(heights, argnums=(0, 1, 2))(*given)
+    assert np.allclose(heights(*given), 2 - 0.93 + 0.2, atol=1e-8)
+    assert np.allclose(by_radius, 2, atol=1e-6)
+    assert np.allclose(by_floor, 2, atol=1e-6)
+    assert np.allclose(by_height, -np.eye(2), atol=1e-6)
+
+
+def test_first_root_of_cubics():
+    """Against a fine grid; also where a cubic first rises, and where it only dips below zero."""
+    rng = np.random.default_rng(0)
+    g0, r0, g1, r1 = (jnp.asarray(a) for a in rng.normal(size=(4, 20_000)) * np.array([1, 4, 1, 4])[:, None])
+    g0 = jnp.abs(g0)
+    s = np.linspace(0, 1, 4001)[:, None]
+    c2, c3 = 3 * (g1 - g0) - 2 * r0 - r1, 2 * (g0 - g1) + r0 + r1
+    values = np.asarray(g0 + s * (r0 + s * (c2 + s * c3)))
+    below = values < -1e-6
+    wanted = np.where(below.any(axis=0), s[below.argmax(axis=0), 0], np.inf)
+    found, most = first_root(g0, r0, g1, r1)
+    sure = below.any(axis=0) | (values.min(axis=0) > 1e-6)
+    assert np.array_equal(np.isfinite(found)[sure], np.isfinite(wanted)[sure])
+    both = np.isfinite(found) & np.isfinite(wanted)
+    assert (found[both] <= most[both]).all()
+    assert np.quantile(np.abs(found - wanted)[both], 0.99) < 1e-3
 
 
 # --- What is not in closed form ------------------------------------------------------------------------------------

@@ -45,6 +45,10 @@ class Contact(eqx.Module):
         """Depth (m) beyond which a candidate is not in contact but through: an impossible state."""
 
     @abc.abstractmethod
+    def travel(self, radii: Float[Array, " bodies"]) -> Float[Array, " c"]:
+        """How much (m or rad) points may move while a gap changes smoothly: by more, it may close and open unseen."""
+
+    @abc.abstractmethod
     def bodies_of(self) -> tuple[tuple[int, ...], ...]:
         """The bodies of each candidate."""
 
@@ -117,6 +121,9 @@ class DiskDisk(Contact):
         a, b = np.array(self.pairs).T
         return radii[a] + radii[b]
 
+    def travel(self, radii):
+        return self.reach(radii) / 2
+
     def bodies_of(self):
         return self.pairs
 
@@ -153,6 +160,10 @@ class DiskPlane(Contact):
 
     def reach(self, radii):
         return radii[np.array(self.bodies)]
+
+    def travel(self, radii):
+        # Nothing is behind a plane, and the gap of a body that moves straight on is a straight line.
+        return jnp.full(len(self.bodies), jnp.inf, radii.dtype)
 
     def bodies_of(self):
         return tuple((b,) for b in self.bodies)
@@ -216,6 +227,11 @@ class RimPlane(Contact):
 
     def reach(self, radii):
         return 2 * radii[np.array(self.bodies)]
+
+    def travel(self, radii):
+        # Less than the arc from one point of the rim to the next: the deepest one changes.
+        angle = 0.5 if self.angles is None else min(0.5, np.pi / len(self.angles))
+        return angle * radii[np.array(self.bodies)]
 
     def bodies_of(self):
         return tuple((b,) for b in self.bodies)

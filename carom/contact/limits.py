@@ -84,6 +84,9 @@ class BendLimit(Contact):
     def reach(self, radii):
         return jnp.full(len(self.property_index), jnp.inf, radii.dtype)
 
+    def travel(self, radii):
+        return jnp.full(len(self.property_index), 0.5, radii.dtype)  # rad
+
     def bodies_of(self):
         return self.chain.bodies_of(3)
 
@@ -119,6 +122,10 @@ class StretchLimit(Contact):
 
     def reach(self, radii):
         return jnp.full(len(self.property_index), jnp.inf, radii.dtype)
+
+    def travel(self, radii):
+        half = ((self.longest - self.shortest) / 2).astype(radii.dtype)
+        return jnp.broadcast_to(half, (len(self.property_index),))
 
     def bodies_of(self):
         return self.chain.bodies_of(2)

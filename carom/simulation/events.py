@@ -12,12 +12,14 @@ after they have opened, and those that close after the last event that a step ma
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.simulation.impact import Stepper, StepResult, impact_at
+from carom.contact.impulses import ContactState, Jump
+from carom.simulation.impact import Stepper, StepResult, after_impact, contact_jump
 from carom.system import System
 
 State = tuple[Float[Array, "n d"], Float[Array, "n d"]]
@@ -34,15 +36,19 @@ def step_with_events(
     """One step, cut at up to `stepper.events` times at which contacts close; `motion` is that of `smooth_flow`."""
 
     def part(carry, last):
-        state, left = carry
-        state, left, closed = to_next_event(system, state, left, last, motion)
-        out = impact_at(system, *state, inverse_mass, stepper, closed)
-        return ((out.x, out.v), left), (out.contact, out.overflow, out.residual)
+        state, left, over, acted = carry
+        state, left, closed, happens = to_next_event(system, state, left, last, over, acted, motion)
+        contacts, jump = contact_jump(system, *state, inverse_mass, stepper, closed)
+        out = after_impact(contacts, jump)
+        x = out.x - jnp.where(happens, own_times(contacts, jump, stepper.dt), 0)
+        return ((x, out.v), left, ~happens, closed), (out.contact, out.overflow, out.residual)
 
     # One program for all parts of the step, the last of which ends where the step does.
     last = jnp.arange(stepper.events + 1) == stepper.events
-    ((x, v), _), (contact, overflow, residual) = jax.lax.scan(part, ((x, v), stepper.dt), last)
-    return StepResult(x, v, jnp.any(contact), jnp.sum(overflow), jnp.max(residual))
+    none = jnp.zeros(system.n_candidates, bool)
+    start = ((x, v), stepper.dt, jnp.asarray(False), none)
+    ((x, v), *_), (contact, overflow, residual) = jax.lax.scan(part, start, last)
+    return StepResult(x, v, jnp.any(contact), jnp.max(overflow), jnp.max(residual))
 
 
 # The time of the event is found without derivatives, on an interpolant of the step. One Newton step at the state there,
@@ -52,33 +58,67 @@ def step_with_events(
 #
 # takes away what the interpolant was wrong by, and its plain derivative is the implicit one,
 # dt = -(d gap / d theta) / gap'. The state is moved along by its Taylor series.
+
+_LATEST = 0.05
+"""An event is taken for one if the interpolant was wrong by no more than this share of the time that was left."""
+
+
 def to_next_event(
-    system: System, state: State, left: Float[Array, ""], last: Bool[Array, ""], motion: tuple[Callable, Callable]
-) -> tuple[State, Float[Array, ""], Bool[Array, " C"]]:
+    system: System,
+    state: State,
+    left: Float[Array, ""],
+    last: Bool[Array, ""],
+    over: Bool[Array, ""],
+    acted: Bool[Array, " C"],
+    motion: tuple[Callable, Callable],
+) -> tuple[State, Float[Array, ""], Bool[Array, " C"], Bool[Array, ""]]:
     """The state at the next event within the time that is left (s), the time left then, and what is closed there.
 
-    Without an event the state and the time are what they were, and nothing is closed. The `last` part of a step goes
-    to its end, by the rule of which closed is what has a negative gap.
+    Also whether there was one. Without, the state and the time are what they were, and nothing is closed. The `last`
+    part of a step goes to its end, by the rule of which closed is what has a negative gap. `over`: there is no other
+    event; `acted`: contacts that have acted just before.
     """
     rate, after = motion
-    frozen = jax.lax.stop_gradient(state)
-    event = next_event(system, frozen, jax.lax.stop_gradient(after(state, left)), jax.lax.stop_gradient(left))
-    happens = event.happens & ~last
-    time = jnp.where(last, left, jnp.where(happens, event.time, 0))
+    frozen, end, fixed = jax.lax.stop_gradient((state, after(state, left), left))
+    # Nothing in the search is differentiated, the system's own geometry included.
+    still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
+    event = next_event(still, frozen, end, jnp.where(last | over, 0, fixed), acted)
+    time = jnp.where(last, left, event.time)
     x, v = after(state, time)
 
     def gap_of(x):
         return system.gaps(x)[event.candidate]
 
     gap, speed = jax.jvp(gap_of, (x,), (v,))
-    closing = happens & (speed < 0)
+    closing = event.happens & (speed < 0)
     late = jnp.asarray(jnp.where(closing, -gap / jax.lax.stop_gradient(jnp.where(closing, speed, 1)), 0))
-    acceleration = rate((x, v))[1]
+    met = time + late
+    happens = closing & (jnp.abs(late) <= _LATEST * fixed) & (met >= 0) & (met <= fixed)
+    late = jnp.asarray(jnp.where(happens, late, 0))
+    acceleration = jax.lax.stop_gradient(rate((x, v))[1])
     x, v = x + late * v + late**2 / 2 * acceleration, v + late * acceleration
     gaps = jax.lax.stop_gradient(system.gaps(x))
     this = jnp.arange(gaps.shape[0]) == event.candidate
     meet = happens & (this | (gaps <= touching(gaps.dtype)))
-    return (x, v), left - time - late, jnp.where(last, gaps < 0, meet)
+    return (x, v), jnp.asarray(left - time - late), jnp.asarray(jnp.where(last, gaps < 0, meet)), happens
+
+
+def own_times(contacts: ContactState, jump: Jump, dt: Float[Array, ""]) -> Float[Array, "n d"]:
+    """What the positions lose because contacts that close together do so each at its own time (m).
+
+    As good as zero, but for its derivative: contact k acts `gap_k / speed_k` before the event, or after. To first
+    order, and exact for contacts that do not act on one another.
+    """
+    if jump.impulse is None:
+        return jnp.zeros_like(contacts.x)
+    active, near = contacts.active, touching(contacts.x.dtype)
+    speed = jax.lax.stop_gradient(contacts.velocity[:, 0])
+    closing = active.active & (active.gap > -near) & (_REOPENING * dt * speed < -near)
+    late = jnp.where(closing, -active.gap / jnp.where(closing, speed, 1), 0)
+    impulse = jnp.sum(jump.impulse, axis=0)
+    response = contacts.response.reshape(*impulse.shape, *contacts.x.shape)
+    kicks = jax.lax.stop_gradient(jnp.einsum("kr,krid->kid", impulse, response))
+    return jnp.einsum("k,kid->id", late, kicks)
 
 
 def touching(dtype) -> float:
@@ -90,13 +130,14 @@ def touching(dtype) -> float:
 #
 # Positions are a cubic in time, from both ends of the interval with their velocities. It is gone along in pieces in
 # which nothing moves far beside the size of the bodies, so that none passes through another unseen; mostly there is
-# one. In a piece each gap is a cubic in time again. The first root of any is refined on the interpolant.
+# one. In a piece each gap is a cubic in time again. Where one goes below zero, so must the gap itself, or the piece
+# ends there and the next is begun. The first root is refined on the interpolant.
 
 _REOPENING = 1e-3
 """Share of the interval in which a contact that touches at its start must open, or it is taken to rest."""
-_FARTHEST = 0.5
-"""Farthest way in a piece, as a share of the way through a body."""
-_MOST_PIECES = 1000
+_SHORTEST = 0.02
+"""Shortest piece, as a share of the interval."""
+_MOST_PIECES = 200
 
 
 class Event(NamedTuple):
@@ -105,8 +146,8 @@ class Event(NamedTuple):
     candidate: Int[Array, ""]
 
 
-class _Piece(NamedTuple):
-    """A piece `[start, end]` of the interval, looked at up to `end`."""
+class _Search(NamedTuple):
+    """How far it has come, and what it has found."""
 
     end: Float[Array, ""]
     gap: Float[Array, " C"]
@@ -114,78 +155,84 @@ class _Piece(NamedTuple):
     is_open: Bool[Array, " C"]
     found: Bool[Array, ""]
     lower: Float[Array, ""]
-    upper: Float[Array, ""]
     guess: Float[Array, ""]
     candidate: Int[Array, ""]
-    number: Int[Array, ""]
+    pieces: Int[Array, ""]
 
 
-def next_event(system: System, start: State, end: State, time: Float[Array, ""]) -> Event:
-    """The first time at which an open gap closes on the way from `start` to `end`, `time` (s) later."""
+def next_event(system: System, start: State, end: State, time: Float[Array, ""], acted: Bool[Array, " C"]) -> Event:
+    """The first time at which an open gap closes on the way from `start` to `end`, `time` (s) later.
+
+    Contacts that have `acted` at the start must open first.
+    """
+    total = jnp.where(time > 0, time, 1)
 
     def gaps_at(t):
-        where, velocity = hermite(start, end, time, t)
+        where, velocity = hermite(start, end, total, t)
         return jax.jvp(system.gaps, (where,), (velocity,))
 
     gap, speed = gaps_at(jnp.zeros_like(time))
     longest = longest_piece(system, start, end, time, gap)
     nothing, near = jnp.zeros_like(time), touching(gap.dtype)
+    clear = jnp.maximum(1e-3 * near, 8 * jnp.finfo(gap.dtype).eps * jnp.max(jnp.abs(start[0])))
     # The first piece is a short one: what touches at the start is open if it is by then, or if it closes at speed.
-    first = _Piece(
+    closes = (gap > -near) & (_REOPENING * time * speed < -near)
+    first = _Search(
         end=nothing,
         gap=gap,
         speed=speed,
-        is_open=(gap > near) | ((gap > -near) & (_REOPENING * time * speed < -near)),
+        is_open=((gap > near) | closes) & ~acted,
         found=jnp.asarray(False),
         lower=nothing,
-        upper=nothing,
         guess=nothing,
         candidate=jnp.asarray(0),
-        number=jnp.asarray(0),
+        pieces=jnp.asarray(0),
     )
 
-    def keep_going(piece: _Piece):
-        return ~piece.found & (piece.end < time) & (piece.number < _MOST_PIECES)
+    def keep_going(search: _Search):
+        return ~search.found & (search.end < time) & (search.pieces < _MOST_PIECES)
 
-    def body(piece: _Piece) -> _Piece:
-        length = jnp.where(piece.number == 0, _REOPENING * time, longest)
-        end = jnp.minimum(piece.end + length, time)
-        end = jnp.where(piece.number == _MOST_PIECES - 1, time, end)
-        length = end - piece.end
-        gap, speed = gaps_at(end)
-        share, most = first_root(piece.gap, length * piece.speed, gap, length * speed)
-        share = jnp.where(piece.is_open, share, jnp.inf)
+    def body(search: _Search) -> _Search:
+        length = jnp.where(search.pieces == 0, _REOPENING * time, longest)
+        whole = jnp.minimum(search.end + length, time)
+        whole = jnp.where(search.pieces == _MOST_PIECES - 1, time, whole)
+        length = whole - search.end
+        gap, speed = gaps_at(whole)
+        share, most = first_root(search.gap, length * search.speed, gap, length * speed)
+        share = jnp.where(search.is_open, share, jnp.inf)
         which = jnp.argmin(share)
-        found = share[which] <= 1
-        return _Piece(
+        root = share[which] <= 1
+        # Where the cubic dips below zero, so may the gap, or not.
+        end = jnp.where(root & (most[which] < 1), search.end + length * most[which], whole)
+        gap, speed = gaps_at(end)
+        return _Search(
             end=end,
             gap=gap,
             speed=speed,
-            is_open=(piece.is_open & (gap >= 0)) | (gap > 1e-3 * near),
-            found=found,
-            lower=piece.end,
-            upper=piece.end + length * most[which],
-            guess=piece.end + length * jnp.where(found, share[which], 0),
+            is_open=(search.is_open & (gap >= 0)) | (gap > clear),
+            found=root & (gap[which] < 0),
+            lower=search.end,
+            guess=search.end + length * jnp.where(root, share[which], 0),
             candidate=which,
-            number=piece.number + 1,
+            pieces=search.pieces + 1,
         )
 
-    piece = jax.lax.while_loop(keep_going, body, first)
+    search = jax.lax.while_loop(keep_going, body, first)
 
     def gap_of(t, _):
-        return gaps_at(t)[0][piece.candidate]
+        where, _ = hermite(start, end, total, t)
+        return jnp.where(search.found, system.gaps(where)[search.candidate], t - search.guess)
 
     refined = optx.root_find(
         gap_of,
-        optx.Newton(rtol=1e-12, atol=1e-3 * touching(gap.dtype) * float(jnp.finfo(gap.dtype).eps) ** 0.25),
-        piece.guess,
-        options={"lower": piece.lower, "upper": piece.upper},
+        optx.Newton(rtol=1e-9, atol=0.01 * near),
+        search.guess,
+        options={"lower": search.lower, "upper": search.end},
         max_steps=8,
         throw=False,
     ).value
-    happens = piece.found
-    refined = jnp.where(jnp.isfinite(refined), refined, piece.guess)
-    return Event(happens, jnp.where(happens, refined, 0), piece.candidate)
+    refined = jnp.where(jnp.isfinite(refined), refined, search.guess)
+    return Event(search.found, jnp.where(search.found, refined, 0), search.candidate)
 
 
 def hermite(start: State, end: State, time: Float[Array, ""], t: Float[Array, ""]) -> State:
@@ -205,9 +252,9 @@ def longest_piece(
     speeds = jnp.maximum(*(jnp.linalg.norm(v, axis=-1) for v in (start[1], end[1])))
     # A gap changes no faster than the speeds of its points allow.
     fastest = jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * speeds[candidates.stencil], axis=1)
-    near = gap <= fastest * time
-    allowed = _FARTHEST * system.reach() / jnp.where(fastest > 0, fastest, 1)
-    return jnp.min(jnp.where(near & (fastest > 0), allowed, jnp.inf), initial=jnp.inf)
+    matters = (fastest > 0) & (gap <= fastest * time)
+    allowed = jnp.where(matters, system.travel() / jnp.where(fastest > 0, fastest, 1), jnp.inf)
+    return jnp.maximum(jnp.min(allowed, initial=jnp.inf), _SHORTEST * time)
 
 
 def first_root(
@@ -222,12 +269,12 @@ def first_root(
     def value(s):
         return g0 + s * (r0 + s * (c2 + s * c3))
 
-    # The minimum: the root of the derivative at which it grows.
+    # The minimum: the root of the derivative at which it grows, without cancellation.
     discriminant = c2**2 - 3 * c3 * r0
-    divisor = c2 + jnp.sqrt(jnp.maximum(discriminant, 0))
-    lowest = -r0 / jnp.where(divisor > 0, divisor, 1)
-    inside = (discriminant > 0) & (divisor > 0) & (lowest > 0) & (lowest < 1)
-    dips = inside & (value(lowest) < 0)
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    plus, minus = jnp.where(c2 > 0, c2 + root, 1), jnp.where((c2 <= 0) & (c3 > 0), 3 * c3, jnp.inf)
+    lowest = jnp.where(c2 > 0, -r0 / plus, (root - c2) / minus)
+    dips = (discriminant > 0) & (lowest > 0) & (lowest < 1) & (value(lowest) < 0)
     most = jnp.where(dips, lowest, 1.0)
 
     def halve(_, bracket):

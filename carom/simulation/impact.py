@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import require
-from carom.contact.candidates import Active
 from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
@@ -92,7 +91,7 @@ def contact_jump(
     inverse_mass: Float[Array, "n n"],
     stepper: Stepper,
     closed: Bool[Array, " C"] | None = None,
-) -> tuple[Active, Jump]:
+) -> tuple[ContactState, Jump]:
     """The contacts that are closed at `x`, and how they change the velocity (S.8 to S.15).
 
     `closed`: which these are, if not those whose gap is negative.
@@ -117,33 +116,35 @@ def contact_jump(
         depth = jnp.where(active.active, jnp.maximum(-active.gap, 0), 0)
         time = stepper.dt * stepper.compensation_steps.astype(stepper.dt.dtype)
         v_star = target_velocity(active.jacobian, depth, joints, time=time)
-    jump = system.contact_model(
-        ContactState(
-            x=x,
-            v=v,
-            active=active,
-            response=response,
-            delassus=delassus,
-            velocity=velocity,
-            target=v_star,
-            friction=friction,
-            restitution=system.restitution[active.property_index],
-        ),
-        smoothing=stepper.smoothing,
+    contacts = ContactState(
+        x=x,
+        v=v,
+        active=active,
+        response=response,
+        delassus=delassus,
+        velocity=velocity,
+        target=v_star,
+        friction=friction,
+        restitution=system.restitution[active.property_index],
     )
-    return active, jump
+    return contacts, system.contact_model(contacts, smoothing=stepper.smoothing)
 
 
 def impact_at(
-    system: System,
-    x: Float[Array, "n d"],
-    v: Float[Array, "n d"],
-    inverse_mass: Float[Array, "n n"],
-    stepper: Stepper,
-    closed: Bool[Array, " C"] | None = None,
+    system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], inverse_mass: Float[Array, "n n"], stepper: Stepper
 ) -> StepResult:
-    """Let the contacts that are closed at `x` change the velocity. For `closed` see `contact_jump`."""
-    active, jump = contact_jump(system, x, v, inverse_mass, stepper, closed)
+    """Let the contacts that are closed at `x` change the velocity."""
+    contacts, jump = contact_jump(system, x, v, inverse_mass, stepper)
+    return after_impact(contacts, jump)
+
+
+def after_impact(contacts: ContactState, jump: Jump) -> StepResult:
+    """The state with the velocity changed."""
+    active = contacts.active
     return StepResult(
-        x=x, v=v + jump.velocity, contact=jnp.any(active.active), overflow=active.overflow, residual=jump.residual
+        x=contacts.x,
+        v=contacts.v + jump.velocity,
+        contact=jnp.any(active.active),
+        overflow=active.overflow,
+        residual=jump.residual,
     )

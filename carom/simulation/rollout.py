@@ -149,6 +149,10 @@ def simulate(
     )
     require_values("dt", dt, np.asarray(dt) > 0 if is_known(dt) else True, "a positive number of seconds")
     check_compensation_steps(compensation_steps)
+    require(
+        impact == "step" or system.step_model is None,
+        f'impact must be "step" for a system with a step_model, which is blind to events; it was {impact!r}.',
+    )
     check_initial_state(system, x0, v0)
     if force is not None:
         force = as_floats(force)
