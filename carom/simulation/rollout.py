@@ -100,7 +100,7 @@ def simulate(
     x0: Float[Array, "*b n d"],
     v0: Float[Array, "*b n d"],
     *,
-    dt: float,
+    dt: float | Float[Array, ""],
     steps: int,
     impact: ImpactRule = "step",
     max_events: int = 2,
