@@ -82,7 +82,7 @@ def test_a_refinement_can_be_enough(cp3, cp3_data, tmp_path):
     system, report = learn(cp3, cp3_data, config, run=run, progress=False)
     run.close()
     assert (report.epochs, report.stopped_early, report.refined) == (2, True, True)
-    assert report.val_loss == run.metrics()[-1]["val_loss"]
+    assert report.val_loss <= run.metrics()[-1]["val_loss"]
     again = RunFolder.open(tmp_path / "run")
     resumed, report = learn(cp3, cp3_data, config, run=again, progress=False)
     again.close()

@@ -113,6 +113,8 @@ REFINE_AFTER = 0.4
 
 If that is not enough, the network goes on learning with the right masses, which it cannot tell from its own errors.
 """
+EXACT = 0.01
+"""A refinement that came to this share of what is enough is not refined again."""
 LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
 
@@ -318,9 +320,8 @@ def learn(
     refines = config.refine and can_be_refined(state.unknowns, trained)
     refine_at = round(REFINE_AFTER * config.epochs)
 
-    def is_enough(state: TrainState) -> bool:
-        just_refined = bool(state.settled) and int(state.best_epoch) == refine_at
-        return just_refined and float(state.best_loss) <= config.enough * speed
+    def just_refined(state: TrainState) -> bool:
+        return bool(state.settled) and int(state.best_epoch) == refine_at
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
         """Unknowns that validate better than these, and how well they do."""
@@ -332,7 +333,7 @@ def learn(
 
     with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
-            if is_enough(state):
+            if just_refined(state) and float(state.best_loss) <= config.enough * speed:
                 stopped = True
                 break
             state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
@@ -371,8 +372,9 @@ def learn(
             if epoch - int(state.best_epoch) >= config.patience:
                 stopped = True
                 break
-        best, val_loss, has_refined = state.best, float(state.best_loss), is_enough(state)
-        better = refined(best, val_loss) if refines and not has_refined else None
+        best, val_loss = state.best, float(state.best_loss)
+        exact = just_refined(state) and val_loss <= EXACT * config.enough * speed
+        better = refined(best, val_loss) if refines and not exact else None
         best, val_loss = (best, val_loss) if better is None else better
     system = best.assemble(skeleton)
     report = LearnReport(
@@ -384,7 +386,7 @@ def learn(
         stopped_early=stopped,
         skipped_steps=int(state.skipped),
         overflowed_contacts=int(state.overflow),
-        refined=has_refined or better is not None,
+        refined=just_refined(state) or better is not None,
     )
     return system, report
 
