@@ -20,7 +20,7 @@ from carom.view.style import BLUE, INK, VERMILLION, figure_style, new_figure, sa
 RADIUS, SPEED, TIME, STEPS = 0.1, 2.0, 1.0, 20
 """Radius (m), speed downward (m/s), time (s), number of steps: few, so that one can see what each does."""
 
-HEIGHTS = np.linspace(0.9, 1.1, 201)
+HEIGHTS = np.linspace(0.75, 1.25, 201)
 """Initial heights (m)."""
 
 
