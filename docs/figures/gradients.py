@@ -6,7 +6,6 @@ The task *bounce once* of Zhong, Han and Brikis (2022): a ball of radius 0.1 m a
 no gravity, elastic, 1 s. A ball that starts higher ends lower: the derivative is -1.
 """
 
-import argparse
 from pathlib import Path
 
 import jax
@@ -16,6 +15,7 @@ import numpy as np
 import carom
 from carom.simulation.impact import ImpactRule
 from carom.view.style import BLUE, INK, VERMILLION, figure_style, new_figure, save_png
+from docs.figures.command import draw_from_command_line
 
 RADIUS, SPEED, TIME, STEPS = 0.1, 2.0, 1.0, 20
 """Radius (m), speed downward (m/s), time (s), number of steps: few, so that one can see what each does."""
@@ -57,9 +57,8 @@ def draw(path: str | Path) -> Path:
             height, slope = final_heights(impact)
             label = f'impact="{impact}"'
             # Where a step more or less is taken, the line is broken.
-            broken = np.insert(height, np.flatnonzero(np.abs(np.diff(height)) > 0.02) + 1, np.nan)
-            places = np.insert(HEIGHTS, np.flatnonzero(np.abs(np.diff(height)) > 0.02) + 1, np.nan)
-            left.plot(places, broken, color=color, label=label)
+            jumps = np.flatnonzero(np.abs(np.diff(height)) > 0.02) + 1
+            left.plot(np.insert(HEIGHTS, jumps, np.nan), np.insert(height, jumps, np.nan), color=color, label=label)
             right.plot(HEIGHTS, slope, color=color, label=label)
         left.set(xlabel="initial height (m)", ylabel="final height (m)", title="where the ball ends")
         right.set(xlabel="initial height (m)", ylabel="derivative", title="what the gradient says", ylim=(-1.5, 1.5))
@@ -67,13 +66,5 @@ def draw(path: str | Path) -> Path:
         return save_png(figure, path)
 
 
-def main() -> None:
-    """Draw the figure into the documentation, or into the file that is named."""
-    parser = argparse.ArgumentParser(description="Draw right and wrong gradients through an impact.")
-    parser.add_argument("file", nargs="?", default="docs/images/gradients.png", help="PNG file to write")
-    jax.config.update("jax_enable_x64", True)
-    print(f"Written to {draw(parser.parse_args().file)}")
-
-
 if __name__ == "__main__":
-    main()
+    draw_from_command_line(draw, "Draw right and wrong gradients through an impact.", "docs/images/gradients.png")

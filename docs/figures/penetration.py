@@ -6,10 +6,8 @@ A point mass falls to the ground with e = 0. Contact acts at the end of the step
 the mass is already 2 cm inside it.
 """
 
-import argparse
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,6 +15,7 @@ from matplotlib.patches import Circle
 
 import carom
 from carom.view.style import BLUE, HATCH, INK, MUTED, TINT, TINT_EDGE, figure_style, new_figure, save_png
+from docs.figures.command import draw_from_command_line
 
 ROWS = {
     1.0: "N = 1, undone in one time step: it bounces",
@@ -83,13 +82,5 @@ def _strip(axes: Axes, trajectory: carom.Trajectory, title: str) -> None:
     axes.grid(False)
 
 
-def main() -> None:
-    """Draw the figure into the documentation, or into the file that is named."""
-    parser = argparse.ArgumentParser(description="Draw the effect of penetration compensation.")
-    parser.add_argument("file", nargs="?", default="docs/images/penetration.png", help="PNG file to write")
-    jax.config.update("jax_enable_x64", True)
-    print(f"Written to {draw(parser.parse_args().file)}")
-
-
 if __name__ == "__main__":
-    main()
+    draw_from_command_line(draw, "Draw the effect of penetration compensation.", "docs/images/penetration.png")
