@@ -50,5 +50,11 @@ from .tasks import load_model as load_model
 from .tasks import make_recording as make_recording
 from .tasks import sample as sample
 from .tasks import task as task
+from .tasks.control import Control as Control
+from .tasks.control import ControlConfig as ControlConfig
+from .tasks.control import ControlReport as ControlReport
+from .tasks.control import Setup as Setup
+from .tasks.control import optimize as optimize
+from .tasks.problems import find_control as find_control
 
 __version__: str

@@ -21,7 +21,7 @@ from carom.mechanics.bodies import PointMass, RigidBody, embed_pose
 from carom.mechanics.constraints import Distance, Joint, Tether
 from carom.simulation.rollout import Trajectory
 from carom.system import System
-from carom.view.animate import _lines_of, _touching, animate
+from carom.view.animate import animate
 from carom.view.figures import (
     _quartiles,
     contact_properties,
@@ -29,6 +29,7 @@ from carom.view.figures import (
     learning_curves,
     trajectory_error,
 )
+from carom.view.scene import lines_of, touching
 from carom.view.style import DPI, ORANGE, TINT
 
 NAN, INF = math.nan, math.inf
@@ -434,7 +435,7 @@ def test_touching_finds_the_closed_contacts():
     contact[50] = True
     x = np.array(motion.x)
     x[50] = [[0.0, -0.5], [0.0, -0.9]]  # the second body reaches 0.05 below y = -1
-    places, closed = _touching(system, trajectory(x, contact=contact))
+    places, closed = touching(system, trajectory(x, contact=contact))
     np.testing.assert_array_equal(np.argwhere(closed), [[50, 1]])
     np.testing.assert_allclose(places[50], [[0, -0.55], [0, -1.05], [0, -0.55]], atol=1e-12)
 
@@ -446,7 +447,7 @@ def test_lines_join_the_right_points():
         [Tether(0, (0.0, 0.0), 0.4), Distance(0, 1, 0.5), Joint(1, (1.0, 0.0, 0.0), (0.5, 0.5))],
     )
     x = np.concatenate([[[0.0, -0.4]], embed_pose(jnp.array([0.5, 0.5]), jnp.eye(2))])
-    lines = _lines_of(system)
+    lines = lines_of(system)
     ends = np.einsum("lsn,nd->lsd", lines.weights, x) + lines.offset
     expected = [
         [[0, -0.4], [0, 0]],

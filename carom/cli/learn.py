@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from carom.learning.dataset import Dataset, trajectory_of
 from carom.learning.evaluate import evaluate, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.model_file import save_model
-from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
+from carom.learning.run import MODEL, REPORT, TRUTH, RunFolder
 from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
 from carom.simulation.rollout import Trajectory
@@ -81,7 +80,7 @@ class Learn:
         self.config.prepare(truth)
         contact_model_of(self.data_contact_model, argument="data_contact_model")
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
-        folder = self._folder()
+        folder = RunFolder.choose(self.out, f"{self.task}-{self.config.model}", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
             dataset, test = self._data(truth, console)
@@ -90,7 +89,7 @@ class Learn:
             run.write_json(TRUTH, quantities(truth))
         else:
             run = RunFolder.open(folder)
-            self._check_same(run)
+            run.check_same(self._description())
             dataset, test = self._data(truth, console)
         console.print(
             f"Learning {self.task} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
@@ -103,16 +102,6 @@ class Learn:
         finally:
             run.close()
         self._finish(console, run, system, report, truth, dataset, test)
-
-    def _folder(self) -> Path:
-        if self.out is not None:
-            return self.out
-        require(not self.resume, "resume needs --out: the folder of the run to go on with.")
-        base = Path("runs") / f"{self.task}-{self.config.model}"
-        number = 1
-        while (path := base if number == 1 else base.with_name(f"{base.name}-{number}")).exists():
-            number += 1
-        return path
 
     def _description(self) -> dict[str, Any]:
         return {
@@ -127,19 +116,6 @@ class Learn:
             "jax_version": jax.__version__,
             "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         }
-
-    def _check_same(self, run: RunFolder) -> None:
-        """Raise if a run would go on with other settings than it was started with."""
-        before = run.read_json(CONFIG)
-        now = self._description()
-        free = {"carom_version", "jax_version", "started"}
-        for name in now:
-            new = list(now[name]) if isinstance(now[name], tuple) else now[name]
-            require(
-                name in free or before.get(name) == new,
-                f"the run in {run.path} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same "
-                "options to go on with it, or another --out.",
-            )
 
     def _data(self, truth: System, console: Console) -> tuple[Dataset, Recording]:
         """Training, validation and test data: read, or simulated from seeds of their own."""

@@ -12,6 +12,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 import tyro
 
 from carom.cli.cache import use_compilation_cache
+from carom.cli.control import ControlCommand
 from carom.cli.evaluate import Evaluate
 from carom.cli.learn import Learn
 from carom.cli.simulate import Simulate
@@ -21,6 +22,7 @@ Command = (
     Annotated[Learn, tyro.conf.subcommand("learn")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[ControlCommand, tyro.conf.subcommand("control")]
 )
 
 
@@ -29,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(
         Command,  # pyright: ignore[reportArgumentType]
         prog="carom",
-        description="Learn mechanical systems with contact from trajectories, and simulate them.",
+        description="Learn mechanical systems with contact from trajectories, simulate and control them.",
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )

@@ -10,9 +10,9 @@ from rich.console import Console
 from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.arguments import CompensationSteps, ContactModelName, FilePath, FolderPath, TaskName
+from carom.cli.runs import learned_system
 from carom.learning.dataset import recording_of
-from carom.learning.model_file import load_model_into, read_model_header
-from carom.learning.run import MODEL, RunFolder
+from carom.learning.run import MODEL
 from carom.simulation.files import load_recording, save_recording
 from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.simulation.rollout import simulate
@@ -58,14 +58,9 @@ class Simulate:
         system, formulation, source = chosen.system(), "lagrangian", "carom simulate"
         compensation = COMPENSATION_STEPS
         if self.run_folder is not None:
-            model = RunFolder.open(self.run_folder).path / MODEL
-            header = read_model_header(model)
-            require(
-                header["task"] == self.task,
-                f"run-folder {self.run_folder} holds a model of task {header['task']!r}, not {self.task!r}.",
-            )
-            system, formulation = load_model_into(model, system), header["formulation"]
-            source, compensation = f"carom simulate, model {model}", header["compensation_steps"]
+            system, header = learned_system(self.run_folder, self.task)
+            formulation, compensation = header["formulation"], header["compensation_steps"]
+            source = f"carom simulate, model {self.run_folder / MODEL}"
         if self.contact_model is not None:
             system, source = (
                 system.with_contact_model(self.contact_model),

@@ -1,4 +1,4 @@
-"""How a solver of many small problems meets batches: block by block, only where there is something to solve."""
+"""How work on many small problems meets batches: block by block, only where there is something to do."""
 
 from collections.abc import Callable
 from typing import Any
@@ -85,3 +85,17 @@ def as_one_batch(solve: Callable[..., Any], name: str) -> Callable[..., Any]:
         )
 
     return undifferentiated
+
+
+def anywhere(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+    """`flag`, or, under vmap, whether any of the batch has it: one flag for all, so that a `cond` on it stays one."""
+
+    @jax.custom_batching.custom_vmap
+    def shared(flag):
+        return flag
+
+    @shared.def_vmap
+    def _(size, is_batched, flags):
+        return shared(jnp.any(flags)), False
+
+    return shared(flag)

@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float
 from carom.checks import require
 from carom.learning.dataset import closing
 from carom.learning.models import Unknowns
-from carom.learning.refine import MOST_POINTS, IdentifyConfig, new_problem, refine, unknowns_of
+from carom.learning.refine import MOST_POINTS, SMALLEST_ERROR, IdentifyConfig, new_problem, refine, unknowns_of
 from carom.learning.robust import Solution
 from carom.learning.sensitivity import StepSensitivity
 from carom.mechanics.dynamics import Formulation
@@ -42,8 +42,6 @@ from carom.simulation.impact import COMPENSATION_STEPS, Stepper
 from carom.system import System
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified"]
-SMALLEST_ERROR = 1e-6
-"""No standard error is reported smaller than this: the contact solver's own accuracy."""
 
 
 @dataclasses.dataclass(frozen=True)

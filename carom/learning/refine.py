@@ -26,6 +26,8 @@ MOST_POINTS = 40
 """Largest system that is refined: derivatives of a step by the state before it grow with the cube of its size."""
 BATCH = 250
 """Steps that are looked at together."""
+SMALLEST_ERROR = 1e-6
+"""No standard error is taken to be smaller than this: the contact solver's own accuracy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,7 +238,8 @@ def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivi
 
 
 def _settled(solution: Solution, count: int) -> bool:
-    return bool(np.all(np.abs(solution.change[:count]) < 0.02 * np.maximum(solution.standard_error[:count], 1e-8)))
+    errors = np.maximum(solution.standard_error[:count], SMALLEST_ERROR)
+    return bool(np.all(np.abs(solution.change[:count]) < 0.02 * errors))
 
 
 def _ridge(problem: Problem) -> float:

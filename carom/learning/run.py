@@ -79,6 +79,32 @@ class RunFolder:
         )
         return run
 
+    @staticmethod
+    def choose(path: Path | None, name: str, *, resume: bool) -> Path:
+        """`path`, or without one `runs/NAME`, with a number if that is taken.
+
+        **Raises:** `CaromError` if a run is to go on, but it is not said where.
+        """
+        if path is not None:
+            return path
+        require(not resume, "resume needs --out: the folder of the run to go on with.")
+        base, number = Path("runs") / name, 1
+        while (found := base if number == 1 else base.with_name(f"{name}-{number}")).exists():
+            number += 1
+        return found
+
+    def check_same(self, now: dict[str, Any]) -> None:
+        """Raise `CaromError` if a run would go on with other settings than it was started with."""
+        before = self.read_json(CONFIG)
+        free = {"carom_version", "jax_version", "started"}
+        for name in now:
+            new = list(now[name]) if isinstance(now[name], tuple) else now[name]
+            require(
+                name in free or before.get(name) == new,
+                f"the run in {self.path} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same "
+                "options to go on with it, or another --out.",
+            )
+
     def read_json(self, name: str) -> Any:
         """The content of a JSON file of the run."""
         path = self.path / name

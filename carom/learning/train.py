@@ -1,6 +1,5 @@
 """The trainer: one for every system and model. `learn` fits the unknowns of a skeleton to a dataset."""
 
-import contextlib
 import dataclasses
 import time
 import warnings
@@ -20,7 +19,7 @@ from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule, make_optimizer
-from carom.learning.progress import TrainingProgress
+from carom.learning.progress import LoopProgress, training_text
 from carom.learning.refine import can_be_refined, polish
 from carom.learning.run import RunFolder
 from carom.simulation.files import Recording
@@ -325,13 +324,12 @@ def learn(
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
         """Unknowns that validate better than these, and how well they do."""
-        if shown is not None:
-            shown.say("refining ...")
+        shown.say("refining ...")
         new = polish(unknowns, trained, stepper, train)
         new_loss = np.inf if new is None else float(validate(new, trained, *held_out, stepper))
         return (new, new_loss) if new is not None and new_loss < val_loss else None
 
-    with TrainingProgress(config.epochs, int(state.epoch)) if progress else contextlib.nullcontext() as shown:
+    with LoopProgress("epoch", config.epochs, int(state.epoch), shown=progress) as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
             if just_refined(state) and float(state.best_loss) <= config.enough * speed:
                 stopped = True
@@ -362,8 +360,7 @@ def learn(
                 run.log(metrics)
                 if epoch % config.checkpoint_every == 0 or epoch in (refine_at, config.epochs):
                     run.save_checkpoint(epoch, state)
-            if shown is not None:
-                shown.update(metrics)
+            shown.update(epoch, training_text(metrics))
             require(
                 bool(jnp.isfinite(loss)) or epoch < 3 or not np.isinf(float(state.best_loss)),
                 f"the training loss is not finite ({int(state.skipped)} steps left out). Check the data, or lower "

@@ -18,11 +18,26 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from carom.contact.batching import anywhere
 from carom.contact.impulses import ContactState, Jump
-from carom.simulation.impact import Stepper, StepResult, after_impact, contact_jump
+from carom.simulation.impact import Stepper, StepResult, after_impact, contact_jump, impact_at
 from carom.system import System
 
 State = tuple[Float[Array, "n d"], Float[Array, "n d"]]
+
+
+class _Progress(NamedTuple):
+    """How far a step has come."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    left: Float[Array, ""]  # s until its end
+    end: State  # where the motion leads by then, if nothing closes
+    acted: Bool[Array, " C"]  # contacts that have acted at this state
+    over: Bool[Array, ""]  # there is no other event
+    contact: Bool[Array, ""]
+    overflow: Int[Array, ""]
+    residual: Float[Array, ""]
 
 
 def step_with_events(
@@ -34,21 +49,56 @@ def step_with_events(
     motion: tuple[Callable, Callable],
 ) -> StepResult:
     """One step, cut at up to `stepper.events` times at which contacts close; `motion` is that of `smooth_flow`."""
+    _, after = motion
+    end = after((x, v), stepper.dt)
+    # Nothing in the search is differentiated, the system's own geometry included.
+    still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
 
-    def part(carry, last):
-        state, left, over, acted = carry
-        state, left, closed, happens = to_next_event(system, state, left, last, over, acted, motion)
-        contacts, jump = contact_jump(system, *state, inverse_mass, stepper, closed)
-        out = after_impact(contacts, jump)
-        x = out.x - jnp.where(happens, own_times(contacts, jump, stepper.dt), 0)
-        return ((x, out.v), left, ~happens, closed), (out.contact, out.overflow, out.residual)
+    def part(now: _Progress, _):
+        start, ends, left = jax.lax.stop_gradient(((now.x, now.v), now.end, now.left))
+        event = next_event(still, start, ends, jnp.where(now.over, 0, left), now.acted)
 
-    # One program for all parts of the step, the last of which ends where the step does.
-    last = jnp.arange(stepper.events + 1) == stepper.events
-    none = jnp.zeros(system.n_candidates, bool)
-    start = ((x, v), stepper.dt, jnp.asarray(False), none)
-    ((x, v), *_), (contact, overflow, residual) = jax.lax.scan(part, start, last)
-    return StepResult(x, v, jnp.any(contact), jnp.max(overflow), jnp.max(residual))
+        def go_on():
+            state, time, closed, happens = to_event((now.x, now.v), left, event, system, motion)
+            contacts, jump = contact_jump(system, *state, inverse_mass, stepper, closed)
+            out = after_impact(contacts, jump)
+            x = out.x - own_times(contacts, jump, stepper.dt)
+            rest = jnp.where(happens, now.left - time, 0)
+            new = _Progress(
+                x=x,
+                v=out.v,
+                left=rest,
+                end=after((x, out.v), rest),
+                acted=closed,
+                over=~happens,
+                contact=now.contact | out.contact,
+                overflow=jnp.maximum(now.overflow, out.overflow),
+                residual=jnp.maximum(now.residual, out.residual),
+            )
+            return jax.tree.map(lambda a, b: jnp.where(happens, a, b), new, now._replace(over=jnp.asarray(True)))
+
+        return jax.lax.cond(anywhere(event.happens), go_on, lambda: now._replace(over=jnp.asarray(True))), None
+
+    def with_contact():
+        none = jnp.zeros(system.n_candidates, bool)
+        no, zero = jnp.asarray(False), jnp.zeros((), x.dtype)
+        start = _Progress(x, v, stepper.dt, end, none, no, no, jnp.asarray(0), zero)
+        progress, _ = jax.lax.scan(part, start, length=stepper.events)
+        out = impact_at(system, *progress.end, inverse_mass, stepper)
+        return StepResult(
+            out.x,
+            out.v,
+            contact=progress.contact | out.contact,
+            overflow=jnp.maximum(progress.overflow, out.overflow),
+            residual=jnp.maximum(progress.residual, out.residual),
+        )
+
+    def alone():
+        return StepResult(end[0], end[1], jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
+
+    start, ends = jax.lax.stop_gradient(((x, v), end))
+    near = may_close(still, start, ends, stepper.dt)
+    return jax.lax.cond(anywhere(near), with_contact, alone)
 
 
 # The time of the event is found without derivatives, on an interpolant of the step. One Newton step at the state there,
@@ -63,28 +113,15 @@ _LATEST = 0.05
 """An event is taken for one if the interpolant was wrong by no more than this share of the time that was left."""
 
 
-def to_next_event(
-    system: System,
-    state: State,
-    left: Float[Array, ""],
-    last: Bool[Array, ""],
-    over: Bool[Array, ""],
-    acted: Bool[Array, " C"],
-    motion: tuple[Callable, Callable],
+def to_event(
+    state: State, left: Float[Array, ""], event: "Event", system: System, motion: tuple[Callable, Callable]
 ) -> tuple[State, Float[Array, ""], Bool[Array, " C"], Bool[Array, ""]]:
-    """The state at the next event within the time that is left (s), the time left then, and what is closed there.
+    """The state at an event that was found within the time that is `left` (s), its time, and what is closed there.
 
-    Also whether there was one. Without, the state and the time are what they were, and nothing is closed. The `last`
-    part of a step goes to its end, by the rule of which closed is what has a negative gap. `over`: there is no other
-    event; `acted`: contacts that have acted just before.
+    Also whether it is one: if not, nothing is closed.
     """
     rate, after = motion
-    frozen, end, fixed = jax.lax.stop_gradient((state, after(state, left), left))
-    # Nothing in the search is differentiated, the system's own geometry included.
-    still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
-    event = next_event(still, frozen, end, jnp.where(last | over, 0, fixed), acted)
-    time = jnp.where(last, left, event.time)
-    x, v = after(state, time)
+    x, v = after(state, event.time)
 
     def gap_of(x):
         return system.gaps(x)[event.candidate]
@@ -92,15 +129,14 @@ def to_next_event(
     gap, speed = jax.jvp(gap_of, (x,), (v,))
     closing = event.happens & (speed < 0)
     late = jnp.asarray(jnp.where(closing, -gap / jax.lax.stop_gradient(jnp.where(closing, speed, 1)), 0))
-    met = time + late
-    happens = closing & (jnp.abs(late) <= _LATEST * fixed) & (met >= 0) & (met <= fixed)
+    met = event.time + late
+    happens = closing & (jnp.abs(late) <= _LATEST * left) & (met >= 0) & (met <= left)
     late = jnp.asarray(jnp.where(happens, late, 0))
     acceleration = jax.lax.stop_gradient(rate((x, v))[1])
     x, v = x + late * v + late**2 / 2 * acceleration, v + late * acceleration
     gaps = jax.lax.stop_gradient(system.gaps(x))
     this = jnp.arange(gaps.shape[0]) == event.candidate
-    meet = happens & (this | (gaps <= touching(gaps.dtype)))
-    return (x, v), jnp.asarray(left - time - late), jnp.asarray(jnp.where(last, gaps < 0, meet)), happens
+    return (x, v), event.time + late, happens & (this | (gaps <= touching(gaps.dtype))), happens
 
 
 def own_times(contacts: ContactState, jump: Jump, dt: Float[Array, ""]) -> Float[Array, "n d"]:
@@ -244,14 +280,28 @@ def hermite(start: State, end: State, time: Float[Array, ""], t: Float[Array, ""
     return x0 + t * (v0 + s * (bend + s * twist)), v0 + s * (2 * bend + 3 * s * twist)
 
 
+def closing_speed(system: System, start: State, end: State) -> Float[Array, " C"]:
+    """How fast each gap can change (m/s): no faster than the speeds of its points allow."""
+    candidates = system.candidates(start[0])
+    speeds = jnp.maximum(*(jnp.linalg.norm(v, axis=-1) for v in (start[1], end[1])))
+    return jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * speeds[candidates.stencil], axis=1)
+
+
+def may_close(system: System, start: State, end: State, time: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a gap can be closed at any time on the way from `start` to `end`, `time` (s) later.
+
+    Twice the speeds at both ends, for what happens in between.
+    """
+    fastest = closing_speed(system, start, end)
+    nearest = jnp.minimum(system.gaps(start[0]), system.gaps(end[0]))
+    return jnp.any(nearest <= 2 * fastest * time + touching(nearest.dtype))
+
+
 def longest_piece(
     system: System, start: State, end: State, time: Float[Array, ""], gap: Float[Array, " C"]
 ) -> Float[Array, ""]:
     """A time (s) in which no body moves far beside the way through what it could meet."""
-    candidates = system.candidates(start[0])
-    speeds = jnp.maximum(*(jnp.linalg.norm(v, axis=-1) for v in (start[1], end[1])))
-    # A gap changes no faster than the speeds of its points allow.
-    fastest = jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * speeds[candidates.stencil], axis=1)
+    fastest = closing_speed(system, start, end)
     matters = (fastest > 0) & (gap <= fastest * time)
     allowed = jnp.where(matters, system.travel() / jnp.where(fastest > 0, fastest, 1), jnp.inf)
     return jnp.maximum(jnp.min(allowed, initial=jnp.inf), _SHORTEST * time)

@@ -1,6 +1,5 @@
 """The named systems. A new one is a `Task` object, listed here."""
 
-import difflib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from carom.simulation.impact import COMPENSATION_STEPS
 from carom.simulation.rollout import simulate
 from carom.system import System
 from carom.tasks.base import Task as Task
+from carom.tasks.base import find_named
 from carom.tasks.bouncing import BP5, BP5_E
 from carom.tasks.disks import BD5, BILLIARDS, THROW
 from carom.tasks.gyroscopes import GYRO, GYRO_E
@@ -31,10 +31,7 @@ TASKS: dict[str, Task] = {task.name: task for task in (*_PAPER, BILLIARDS, THROW
 
 def find_task(name: str) -> Task:
     """The task of this name. Raises `CaromError` with the nearest names for an unknown one."""
-    near = difflib.get_close_matches(name, TASKS, n=1, cutoff=0.4)
-    hint = f"Did you mean {near[0]!r}? " if near else ""
-    require(name in TASKS, f"task must be one of {', '.join(sorted(TASKS))}; it was {name!r}. {hint}".rstrip())
-    return TASKS[name]
+    return find_named("task", name, TASKS)
 
 
 def task(name: str, *, contact_model: str | ContactModel = "cm") -> System:

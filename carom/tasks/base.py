@@ -1,7 +1,9 @@
 """What a task is: a named system with its initial-state distribution and its time step."""
 
 import abc
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -27,6 +29,17 @@ class Task(eqx.Module):
     @abc.abstractmethod
     def sample(self, system: System, key: PRNGKeyArray, n: int) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
         """`n` initial states: positions (m) and velocities (m/s)."""
+
+
+T = TypeVar("T")
+
+
+def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
+    """The object of this name. Raises `CaromError` with the nearest names for an unknown one."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"Did you mean {near[0]!r}? " if near else ""
+    require(name in known, f"{kind} must be one of {', '.join(sorted(known))}; it was {name!r}. {hint}".rstrip())
+    return known[name]
 
 
 def sample_free(

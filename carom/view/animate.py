@@ -9,9 +9,8 @@ import importlib.util
 import os
 import warnings
 from collections.abc import Iterable
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import imageio.v2
 import jax
@@ -19,22 +18,32 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import EllipseCollection, LineCollection
-from matplotlib.colors import to_rgb, to_rgba
+from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from PIL import Image
 
 from carom.checks import require
-from carom.contact.candidates import DiskDisk, DiskPlane
-from carom.mechanics.bodies import RigidBody
-from carom.mechanics.constraints import Distance, Joint, Tether
 from carom.simulation.rollout import Trajectory
 from carom.system import System
+from carom.view.scene import (
+    ALONE_LOOK,
+    PREDICTED_LOOK,
+    TRUE_LOOK,
+    Bodies,
+    Contacts,
+    camera_of,
+    draw_planes,
+    draw_triad,
+    draw_walls,
+    framed,
+    lines_of,
+    planes_near,
+    view_box,
+    walls_of,
+)
 from carom.view.style import (
     BLUE,
-    HATCH,
     INK,
     MUTED,
     ORANGE,
@@ -54,12 +63,6 @@ DPI = 100
 SHORTEST, LONGEST, HOLD = 4.0, 10.0, 0.8
 """Playing time (s) between which the speed is chosen; how long the last frame stays."""
 MOST_FRAMES = 500
-FAR = 1e6
-"""What is farther away (m) is lost."""
-RING_FRAMES = 10
-"""For how many frames a new contact flashes."""
-AZIMUTH, ELEVATION = np.radians(-60), np.radians(20)
-"""From where a system in 3D is seen; the third axis is up."""
 MARGIN, HEADER, PANEL = 14, 58, 104
 """Parts of the picture (pixels)."""
 
@@ -74,6 +77,8 @@ def animate(
     speed: float | int | None = None,
     trail: float | int | None = None,
     width: int = 500,
+    names: tuple[str, str] = ("true", "predicted"),
+    show_error: bool = True,
 ) -> Path:
     """Draw `predicted` as outlines over `true` as filled disks; returns the path.
 
@@ -90,6 +95,8 @@ def animate(
     - `speed`: 1 is real time. By default real time, but so that it takes from 4 to 10 s.
     - `trail`: how much of the past (s) trails behind the bodies; by default a quarter of the whole.
     - `width`: of the picture (pixels).
+    - `names`: what `true` and `predicted` are called in the picture, if they are something else.
+    - `show_error`: whether to show how far `predicted` is from `true`.
 
     **Raises:** `CaromError` for trajectories that do not fit the system, arguments
     out of range, or a path that cannot be written.
@@ -114,7 +121,8 @@ def animate(
     frames, speed, delay = _schedule(time, fps, speed)
     share = 0.25 if trail is None else min(trail / max(float(np.ptp(time)), 1e-12), 1.0)
     with figure_style(), replacing(path) as temporary:
-        picture = _Picture(system, true, predicted, frames, speed, round(share * time.size), width // 2 * 2)
+        past, size = round(share * time.size), width // 2 * 2
+        picture = _Picture(system, true, predicted, frames, speed, past, size, names, show_error)
         if movie:
             _write_mp4(temporary, picture, delay)
         else:
@@ -150,181 +158,45 @@ def _schedule(time: np.ndarray, fps: float | int, speed: float | int | None) -> 
     return frames, duration / playing, playing / len(frames)
 
 
-# --- what there is to draw -----------------------------------------------------------------------
-
-
-def _camera(dim: int) -> np.ndarray:
-    """(d, 2), columns are the picture's axes."""
-    if dim == 2:
-        return np.eye(2)
-    (sa, ca), (se, ce) = ((np.sin(a), np.cos(a)) for a in (AZIMUTH, ELEVATION))
-    return np.array([[-sa, -se * ca], [ca, -se * sa], [0, ce]])
-
-
-def _positions(trajectory: Trajectory, far: float) -> np.ndarray:
-    """Points (time, n, d), NaN where they are farther than `far` (m) from the origin."""
-    x = np.asarray(trajectory.x, float)
-    return np.where(np.abs(x) < far, x, np.nan)
-
-
-class _Lines(NamedTuple):
-    """Lines between points that move with the system: their ends are `weights @ x + offset`."""
-
-    weights: np.ndarray  # (lines, 2, n)
-    offset: np.ndarray  # (lines, 2, d)
-    anchors: np.ndarray  # (anchors, d)
-
-
-def _lines_of(system: System) -> _Lines:
-    """Rods, and a line from the center of each rigid body along its axes to its rim."""
-    n, dim = system.n_points, system.dim
-    unit, zero = np.eye(n), np.zeros(dim)
-    weights, offset, anchors = [], [], []
-    for link in system.links:
-        if isinstance(link, Distance):
-            weights.append([unit[link.i], unit[link.j]])
-            offset.append([zero, zero])
-        elif isinstance(link, Tether | Joint):
-            weights.append([unit[link.i if isinstance(link, Tether) else link.first], 0 * unit[0]])
-            anchors.append(np.asarray(link.anchor, float))
-            offset.append([zero, anchors[-1]])
-    for body, center in zip(system.bodies, system.table.center, strict=True):
-        if isinstance(body, RigidBody):
-            # A turning disk shows one spoke, a body in 3D its three axes.
-            for axis in range(1 if dim == 2 else 3):
-                reach = float(body.radius) or 0.1
-                rim = (1 - reach) * unit[center] + reach * unit[center + 1 + axis]
-                weights.append([unit[center], rim])
-                offset.append([zero, zero])
-    return _Lines(
-        np.reshape(weights, (-1, 2, n)),
-        np.reshape(offset, (-1, 2, dim)),
-        np.reshape(anchors, (-1, dim)),
-    )
-
-
-def _touching(system: System, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Where bodies can touch (time, C, d), and whether they did (time, C)."""
-    x = _positions(trajectory, FAR)[:, list(system.table.center)]
-    radii = np.asarray(system.radii, float)
-    places, gaps = [np.zeros((len(x), 0, system.dim))], [np.zeros((len(x), 0))]
-    for contact in system.contacts:
-        if isinstance(contact, DiskPlane):
-            body, normal = list(contact.bodies), np.asarray(contact.normal, float)
-            gaps.append((x[:, body] - np.asarray(contact.point, float)) @ normal - radii[body])
-            places.append(x[:, body] - radii[body, None] * normal)
-        elif isinstance(contact, DiskDisk) and contact.pairs:
-            a, b = np.array(contact.pairs).T
-            between = x[:, b] - x[:, a]
-            distance = np.linalg.norm(between, axis=-1)
-            gaps.append(distance - radii[a] - radii[b])
-            toward = between / np.maximum(distance, 1e-12)[..., None]
-            places.append(x[:, a] + radii[a, None] * toward)
-    # Recordings in single precision may be that far from closed.
-    closed = np.concatenate(gaps, axis=1) < 1e-6
-    return np.concatenate(places, axis=1), closed & np.asarray(trajectory.contact)[:, None]
-
-
-def _relative_error(true: Trajectory, predicted: Trajectory) -> np.ndarray:
-    """`|z - z^| / |z|` (time,), NaN where the prediction is not finite."""
-    z, guess = (
-        np.concatenate([np.asarray(t.x, float), np.asarray(t.v, float)], axis=1).reshape(len(t.x), -1)
-        for t in (true, predicted)
-    )
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.linalg.norm(z - guess, axis=1) / np.maximum(np.linalg.norm(z, axis=1), 1e-12)
-    return np.where(np.isfinite(error), error, np.nan)
-
-
-class _Wall(NamedTuple):
-    point: np.ndarray
-    normal: np.ndarray
-
-    def gap(self, x: np.ndarray) -> float:
-        return float((x - self.point) @ self.normal)
-
-
-def _walls_of(system: System) -> list[_Wall]:
-    """Each plane once."""
-    found: dict[tuple, _Wall] = {}
-    for contact in system.contacts:
-        if isinstance(contact, DiskPlane):
-            wall = _Wall(np.asarray(contact.point, float), np.asarray(contact.normal, float))
-            key = (*wall.normal.round(9), round(float(wall.point @ wall.normal), 9))
-            found.setdefault(key, wall)
-    return list(found.values())
-
-
-def _box(system: System, trajectory: Trajectory, anchors: np.ndarray) -> np.ndarray:
-    """Lower and upper corner (2, d) of all that the trajectory reaches."""
-    x = _positions(trajectory, FAR)[:, list(system.table.center)]
-    radii = np.asarray(system.radii, float)[:, None]
-    reached = np.concatenate([(x - radii).reshape(-1, system.dim), (x + radii).reshape(-1, system.dim), anchors])
-    reached = reached[np.isfinite(reached).all(axis=1)]
-    return np.array([reached.min(axis=0), reached.max(axis=0)])
-
-
-def _extent(box: np.ndarray) -> float:
-    return max(float(np.max(box[1] - box[0])), 1e-6)
-
-
-def _view_box(system, true, predicted, anchors, walls) -> np.ndarray:
-    """Corners (2, d) of what is shown: the motion, and the walls that are near."""
-    box = _box(system, predicted if true is None else true, anchors)
-    if true is not None:
-        # A prediction that goes astray may leave the picture.
-        room = 0.2 * _extent(box)
-        other = np.clip(_box(system, predicted, anchors), box[0] - room, box[1] + room)
-        box = np.array([np.minimum(box[0], other[0]), np.maximum(box[1], other[1])])
-    extent = _extent(box)
-    for wall in walls:
-        nearest = np.where(wall.normal > 0, box[0], box[1])
-        gap = wall.gap(nearest)
-        if 0 < gap <= extent:
-            foot = nearest - gap * wall.normal
-            box = np.array([np.minimum(box[0], foot), np.maximum(box[1], foot)])
-    return box
-
-
 # --- drawing -------------------------------------------------------------------------------------
 
 
 class _Picture:
     """The figure and all that moves in it; `draw(k)` gives the pixels of frame k."""
 
-    def __init__(self, system, true, predicted, frames, speed, past, width):
+    def __init__(self, system, true, predicted, frames, speed, past, width, names, show_error):
         self.frames, self.speed, self.time = frames, speed, np.asarray(predicted.time, float)
-        camera, lines, walls = _camera(system.dim), _lines_of(system), _walls_of(system)
-        box = _view_box(system, true, predicted, lines.anchors, walls)
-        squares = [square @ camera for square in _planes(walls, box)] if system.dim == 3 else []
+        camera, lines, walls = camera_of(system.dim), lines_of(system), walls_of(system)
+        box = view_box(system, true, predicted, lines.anchors, walls)
+        squares = [square @ camera for square in planes_near(walls, box)] if system.dim == 3 else []
         corners = np.array(np.meshgrid(*box.T)).reshape(system.dim, -1).T @ camera
-        low, high = _framed(np.concatenate([corners, *squares]))
+        low, high = framed(np.concatenate([corners, *squares]))
         inner = width - 2 * MARGIN
         scale = inner / (high[0] - low[0])
         scene = round(scale * (high[1] - low[1]))
-        panel = PANEL if true is not None else 0
+        panel = PANEL if true is not None and show_error else 0
         height = (HEADER + scene + MARGIN + panel + 1) // 2 * 2
         self.figure = new_figure(width / DPI, height / DPI, dpi=DPI, constrained=False)
         axes = self.figure.add_axes((MARGIN / width, (panel + MARGIN) / height, inner / width, scene / height))
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set_axis_off()
         if system.dim == 2:
-            _draw_walls(axes, walls)
+            draw_walls(axes, walls)
         else:
-            _draw_planes(axes, squares)
-            _draw_triad(axes, camera)
+            draw_planes(axes, squares)
+            draw_triad(axes, camera)
         anchors = lines.anchors @ camera
         (self.pivots,) = axes.plot(*anchors.T, "o", color=INK, markersize=5, zorder=5)
 
-        self.parts: list[_Bodies | _Contacts | _ErrorPanel] = []
+        self.parts: list[Bodies | Contacts | _ErrorPanel] = []
         if true is None:
-            self.parts.append(_Bodies(axes, system, predicted, lines, camera, past, ALONE_LOOK))
+            self.parts.append(Bodies(axes, system, predicted, lines, camera, past, ALONE_LOOK))
         else:
-            self.parts.append(_Bodies(axes, system, true, lines, camera, past, TRUE_LOOK))
-            self.parts.append(_Bodies(axes, system, predicted, lines, camera, past, PREDICTED_LOOK))
-        self.parts.append(_Contacts(axes, system, predicted, camera, frames))
-        self._header(system.name, scale, height, width, known=true is not None)
-        if true is not None:
+            self.parts.append(Bodies(axes, system, true, lines, camera, past, TRUE_LOOK))
+            self.parts.append(Bodies(axes, system, predicted, lines, camera, past, PREDICTED_LOOK))
+        self.parts.append(Contacts(axes, system, predicted, camera, frames))
+        self._header(system.name, scale, height, width, names, known=true is not None)
+        if true is not None and show_error:
             rect = ((MARGIN + 40) / width, 38 / height, (inner - 40) / width, 48 / height)
             panel_axes = self.figure.add_axes(rect)
             self.parts.append(_ErrorPanel(panel_axes, self.time, true, predicted))
@@ -337,7 +209,7 @@ class _Picture:
         self.canvas.draw()
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
-    def _header(self, name: str, scale: float, height: int, width: int, *, known: bool) -> None:
+    def _header(self, name: str, scale: float, height: int, width: int, names, *, known: bool) -> None:
         """Name, time, legend and scale."""
         left, right = MARGIN / width, 1 - MARGIN / width
         top, second = 1 - 18 / height, 1 - 42 / height
@@ -347,9 +219,9 @@ class _Picture:
         disk = {"marker": "o", "linestyle": "none", "markersize": 8}
         handles = []
         if known:
-            handles.append(Line2D([], [], mfc=TINT, mec=TINT_EDGE, label="true", **disk))
+            handles.append(Line2D([], [], mfc=TINT, mec=TINT_EDGE, label=names[0], **disk))
         face, edge = ("none", VERMILLION) if known else (TINT, BLUE)
-        handles.append(Line2D([], [], mfc=face, mec=edge, mew=1.5, label="predicted", **disk))
+        handles.append(Line2D([], [], mfc=face, mec=edge, mew=1.5, label=names[1], **disk))
         disk["markersize"] = 5
         handles.append(Line2D([], [], mfc=ORANGE, mec=INK, mew=0.6, label="contact", **disk))
         self.figure.legend(
@@ -381,112 +253,6 @@ class _Picture:
         for artist in self.moving:
             self.figure.draw_artist(artist)
         return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
-
-
-class _Look(NamedTuple):
-    """Colors and line widths (points) of a trajectory; a higher `order` is drawn later."""
-
-    face: str
-    edge: str
-    trail: tuple[str, float]
-    disk_width: float
-    link_width: float
-    trail_width: float
-    order: int
-
-
-TRUE_LOOK = _Look(TINT, TINT_EDGE, (BLUE, 0.5), 1.0, 4.5, 3.0, order=1)
-PREDICTED_LOOK = _Look("none", VERMILLION, (VERMILLION, 0.9), 1.7, 1.5, 1.1, order=4)
-ALONE_LOOK = _Look(TINT, BLUE, (BLUE, 0.7), 1.5, 2.0, 2.0, order=1)
-
-
-class _Bodies:
-    """Disks, links and trails of one trajectory."""
-
-    def __init__(self, axes, system, trajectory, lines, camera, past, look: _Look):
-        x = _positions(trajectory, 1e3 * float(np.diff(axes.get_xlim())[0]))
-        self.centers = x[:, list(system.table.center)] @ camera
-        # A point that is not finite takes only its own lines along: 0 * NaN is not 0.
-        known = np.nan_to_num(x)
-        ends = np.einsum("lsn,tnd->tlsd", lines.weights, known) + lines.offset
-        gone = np.einsum("lsn,tn->tls", np.abs(lines.weights), np.isnan(x).any(-1).astype(float))
-        self.ends = np.where(gone[..., None] > 0, np.nan, ends) @ camera
-        smallest = 0.012 * float(np.diff(axes.get_xlim())[0])
-        sizes = 2 * np.maximum(np.asarray(system.radii, float), smallest)
-        self.disks = EllipseCollection(
-            sizes,
-            sizes,
-            np.zeros_like(sizes),
-            units="x",
-            offsets=self.centers[0],
-            offset_transform=axes.transData,
-            facecolors=look.face,
-            # Twice, as a single style would be drawn as a marker: on whole pixels, by jerks.
-            edgecolors=[look.edge] * 2,
-            linewidths=look.disk_width,
-            zorder=look.order + 0.1,
-        )
-        self.links = LineCollection(
-            [], colors=look.edge, linewidths=look.link_width, capstyle="butt", zorder=look.order
-        )
-        self.past, self.steps = past, max(1, min(30, past))
-        color, strongest = look.trail
-        fade = np.linspace(0, strongest, self.steps + 1)[1:]
-        colors = np.tile([(*to_rgb(color), alpha) for alpha in fade], (len(sizes), 1))
-        self.trail = LineCollection(
-            [],
-            colors=colors,
-            linewidths=look.trail_width,
-            capstyle="butt",
-            zorder=2 + look.order / 10,
-        )
-        self.artists: list[Artist] = [self.trail, self.links, self.disks]
-        for artist in (self.trail, self.links, self.disks):
-            axes.add_collection(artist, autolim=False)
-
-    def update(self, frame: int, sample: int) -> None:
-        self.disks.set_offsets(self.centers[sample])
-        self.links.set_segments(list(self.ends[sample]))
-        samples = np.linspace(sample - self.past, sample, self.steps + 1).round()
-        points = self.centers[np.maximum(samples.astype(int), 0)].swapaxes(0, 1)
-        pieces = np.stack([points[:, :-1], points[:, 1:]], axis=2)
-        self.trail.set_segments(list(pieces.reshape(-1, 2, 2)))
-
-
-class _Contacts:
-    """A dot where bodies touch, and a ring that spreads from where they begin to."""
-
-    def __init__(self, axes, system, predicted, camera, frames):
-        places, closed = _touching(system, predicted)
-        self.places = places @ camera
-        edges = np.concatenate([[-1], frames])
-        self.shown = [closed[a + 1 : b + 1].any(axis=0) for a, b in pairwise(edges)]
-        # Contacts that only flicker, as those of a body at rest may, begin once.
-        recent = np.zeros_like(closed)
-        for lag in range(1, 6):
-            recent[lag:] |= closed[:-lag]
-        begins = np.argwhere(closed & ~recent)
-        self.begin_frame = np.searchsorted(frames, begins[:, 0])
-        self.begin_place = self.places[begins[:, 0], begins[:, 1]]
-        self.extent = float(np.diff(axes.get_xlim())[0])
-        size = np.array([0.02 * self.extent])
-        common: dict[str, Any] = {"units": "x", "offset_transform": axes.transData}
-        self.dots = EllipseCollection(
-            size, size, [0], facecolors=ORANGE, edgecolors=INK, linewidths=0.6, zorder=6, **common
-        )
-        self.rings = EllipseCollection(size, size, [0], facecolors="none", linewidths=2.0, zorder=5, **common)
-        self.artists: list[Artist] = [self.rings, self.dots]
-        axes.add_collection(self.dots, autolim=False)
-        axes.add_collection(self.rings, autolim=False)
-
-    def update(self, frame: int, sample: int) -> None:
-        self.dots.set_offsets(self.places[sample][self.shown[frame]])
-        age = (frame - self.begin_frame) / RING_FRAMES
-        fresh = (age >= 0) & (age < 1)
-        size = self.extent * (0.03 + 0.09 * np.sqrt(age[fresh]))
-        self.rings.set_offsets(self.begin_place[fresh])
-        self.rings.set(widths=size, heights=size, angles=np.zeros_like(size))
-        self.rings.set_edgecolor([to_rgba(ORANGE, 1 - a) for a in age[fresh]])
 
 
 class _ErrorPanel:
@@ -523,84 +289,21 @@ class _ErrorPanel:
         self.text.set_text("not finite" if np.isnan(value) else power(float(value)))
 
 
-def _framed(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower left and upper right of a frame around corners (k, 2), neither very flat nor high."""
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    size = np.maximum(high - low, 1e-6)
-    size = size + 0.14 * size.max()
-    wanted = np.maximum(size, [size[1] / 1.1, size[0] * 0.5])
-    middle = (low + high) / 2
-    return middle - wanted / 2, middle + wanted / 2
+def _relative_error(true: Trajectory, predicted: Trajectory) -> np.ndarray:
+    """`|z - z^| / |z|` (time,), NaN where the prediction is not finite."""
+    z, guess = (
+        np.concatenate([np.asarray(t.x, float), np.asarray(t.v, float)], axis=1).reshape(len(t.x), -1)
+        for t in (true, predicted)
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.linalg.norm(z - guess, axis=1) / np.maximum(np.linalg.norm(z, axis=1), 1e-12)
+    return np.where(np.isfinite(error), error, np.nan)
 
 
 def _round_length(most: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten up to `most`."""
     decade = 10.0 ** np.floor(np.log10(most))
     return float(max(k * decade for k in (1, 2, 5) if k * decade <= most))
-
-
-def _clip(polygon: np.ndarray, wall: _Wall) -> np.ndarray:
-    """The part of a convex polygon (k, 2) in front of a wall (Sutherland and Hodgman)."""
-    kept = []
-    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        gap_a, gap_b = wall.gap(a), wall.gap(b)
-        if gap_a >= 0:
-            kept.append(a)
-        if gap_a * gap_b < 0:
-            kept.append(a + (b - a) * gap_a / (gap_a - gap_b))
-    return np.reshape(kept, (-1, 2))
-
-
-def _draw_walls(axes: Axes, walls: list[_Wall]) -> None:
-    """Hatch what no body can enter, and draw a line around what is free."""
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    frame = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
-    free = frame
-    for wall in walls:
-        free = _clip(free, wall)
-    if not walls or len(free) < 3:
-        return
-    axes.add_patch(Polygon(frame, facecolor=SOLID, hatch="/////", edgecolor=HATCH, linewidth=0))
-    axes.add_patch(Polygon(free, facecolor=PAPER, edgecolor="none"))
-    near = 1e-9 * (right - left)
-    for a, b in zip(free, np.roll(free, -1, axis=0), strict=True):
-        if any(abs(wall.gap(a)) < near and abs(wall.gap(b)) < near for wall in walls):
-            axes.plot(*np.array([a, b]).T, color=MUTED, linewidth=1.6, solid_capstyle="projecting")
-
-
-def _planes(walls: list[_Wall], box: np.ndarray) -> list[np.ndarray]:
-    """Squares (4, 3) on the planes that are near."""
-    reach, middle = 0.55 * _extent(box), box.mean(axis=0)
-    squares = []
-    for wall in walls:
-        gap = wall.gap(middle)
-        if abs(gap) < 3 * reach:
-            tangents = np.linalg.svd(wall.normal[None])[2][1:]
-            turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * reach
-            squares.append(middle - gap * wall.normal + turns @ tangents)
-    return squares
-
-
-def _draw_planes(axes: Axes, squares: list[np.ndarray]) -> None:
-    """Each square (4, 2) with a grid on it."""
-    for a, b, c, d in squares:
-        axes.add_patch(Polygon([a, b, c, d], facecolor=SOLID, edgecolor=MUTED, linewidth=0.8))
-        for k in np.linspace(0, 1, 9)[1:-1]:
-            for start, end in (((a, b), (d, c)), ((a, d), (b, c))):
-                line = [p + k * (q - p) for p, q in (start, end)]
-                axes.plot(*np.transpose(line), color=HATCH, linewidth=0.7, zorder=1)
-
-
-def _draw_triad(axes: Axes, camera: np.ndarray) -> None:
-    """The directions of the three axes, in the lower left corner."""
-    (left, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()
-    length = 0.07 * (right - left)
-    origin = np.array([left, bottom]) + length * np.array([0.8, 0.9])
-    for name, direction in zip("xyz", camera, strict=True):
-        tip = origin + length * direction
-        axes.plot(*np.array([origin, tip]).T, color=MUTED, linewidth=1.2)
-        x, y = origin + 1.35 * length * direction
-        axes.text(x, y, name, ha="center", va="center", color=MUTED)
 
 
 # --- files ---------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from carom.view.style import (
     PALETTE,
     VERMILLION,
     figure_style,
+    log_axis,
     new_figure,
     note,
     power,
@@ -347,13 +348,8 @@ def _log_line(axes: Axes, x: np.ndarray, y: np.ndarray, **style) -> bool:
     """Draw the finite positive values on a logarithmic axis; whether there were any."""
     drawn = _line(axes, x, y, np.isfinite(y) & (y > 0), **style)
     if drawn:
-        _log_axis(axes)
+        log_axis(axes)
     return drawn
-
-
-def _log_axis(axes: Axes) -> None:
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(numticks=6))
 
 
 def _epoch_axis(axes: Axes, epochs: np.ndarray) -> None:
@@ -444,7 +440,7 @@ def _error_panel(axes: Axes, epochs: np.ndarray, quantity: _Quantity) -> None:
     for k, value in enumerate(() if kept is None else kept):
         color = _color(quantity, k + quantity.relative)
         axes.plot(epochs[-1], max(value, floor), color=color, zorder=4, clip_on=False, **KEPT)
-    _log_axis(axes)
+    log_axis(axes)
     if (seen == 0).any():
         _show_zero(axes, floor)
     last = mean[np.isfinite(mean)][-1] if kept is None else np.nanmean(kept)

@@ -12,6 +12,7 @@ import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from carom.atomic import replacing
 from carom.errors import CaromError
@@ -120,6 +121,12 @@ def checked_path(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
 def note(axes: Axes, text: str) -> None:
     """Say in the middle of an empty panel why it is empty."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=MUTED)
+
+
+def log_axis(axes: Axes) -> None:
+    """A logarithmic vertical axis with few marks."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(numticks=6))
 
 
 def power(value: float) -> str:
