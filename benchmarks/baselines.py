@@ -21,7 +21,7 @@ from carom.cli.main import configure_jax
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import Dataset
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
-from carom.tasks import find_task
+from carom.tasks import make_data_sets
 
 MODELS = ("clnn", "mlp-cd-clnn", "in-cp-clnn", "in-cp-sp")
 PAPER = {
@@ -37,13 +37,9 @@ TEST_SEED = 1_000_000
 
 def recordings(task: str, trajectories: int, seed: int) -> tuple[Dataset, carom.Recording]:
     """Training and validation data, and 100 test trajectories of at least 100 steps."""
-    system, chosen = carom.task(task), find_task(task)
-    key = jax.random.key(seed)
-    train = carom.make_recording(system, jax.random.fold_in(key, 0), trajectories)
-    val = carom.make_recording(system, jax.random.fold_in(key, 1), max(trajectories // 8, 2))
-    x0, v0 = carom.sample(system, jax.random.fold_in(key, TEST_SEED), 100)
-    test = carom.simulate(system, x0, v0, dt=chosen.dt, steps=max(100, chosen.steps))
-    return Dataset(train, val), carom.recording_of(test, task=task)
+    key, parts = jax.random.key(seed), [(0, trajectories), (1, max(trajectories // 8, 2)), (TEST_SEED, 100)]
+    train, val, test = make_data_sets(carom.task(task), *((jax.random.fold_in(key, k), n) for k, n in parts))
+    return Dataset(train, val), test
 
 
 def measured(model: str, options: argparse.Namespace, data, folder: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """carom learns mechanical systems with contact from trajectories and hands back a differentiable simulator."""
 
+from .contact.boxes import CornerPlane as CornerPlane
 from .contact.candidates import Contact as Contact
 from .contact.candidates import DiskDisk as DiskDisk
 from .contact.candidates import DiskPlane as DiskPlane

@@ -198,7 +198,7 @@ def test_robust_least_squares_ignores_outliers_and_knows_its_error():
         u = -J @ true + rng.normal(size=(n, q))
         u[: n // 12] += 30
         blocks = Blocks(u, J, np.arange(n) // 3, np.zeros(n, int))
-        out = solve(blocks, np.ones(3), np.zeros(3), -unbounded, unbounded, redescend=True)
+        out = solve(blocks, np.eye(3), np.zeros(3), -unbounded, unbounded, redescend=True)
         z.append((out.change - true)[:2] / out.standard_error[:2])
         assert out.standard_error[2] >= 0.999
         assert (out.weight[: n // 12] < 0.01).all()
@@ -206,5 +206,5 @@ def test_robust_least_squares_ignores_outliers_and_knows_its_error():
     assert abs(z.mean()) < 0.2  # 400 values: 4 standard deviations
     assert 0.9 < np.mean(np.abs(z) < 1.96) <= 0.99
     assert blocks is not None
-    held = solve(blocks, np.ones(3), np.zeros(3), np.array([-1, -0.2, -1.0]), np.ones(3), redescend=True)
+    held = solve(blocks, np.eye(3), np.zeros(3), np.array([-1, -0.2, -1.0]), np.ones(3), redescend=True)
     assert held.change[1] == -0.2

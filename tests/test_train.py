@@ -114,6 +114,10 @@ def test_the_refinement_at_the_end_brings_all_that_is_learned_nearer(cp3, cp3_da
     assert after.val_loss < 0.1 * before.val_loss
     rough_error, refined_error = (np.abs(numbers(system) - numbers(cp3)).max() for system in (rough, refined))
     assert refined_error < 0.01 * rough_error
+    # Gravity is the uniform field's, not the network's: forces are right far from all data too.
+    away = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2)) * 10)
+    force, true = (-jax.grad(system.potential_energy)(away) for system in (refined, cp3))
+    assert np.abs(force - true).max() < 1e-2 * np.abs(true).max()
 
 
 def test_what_can_be_refined(cp3):

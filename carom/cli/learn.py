@@ -24,7 +24,7 @@ from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
-from carom.tasks import make_recordings, task
+from carom.tasks import make_data_sets, task
 
 TEST_DATA = "test.h5"
 QUICK = {"trajectories": 100, "epochs": 20}
@@ -125,9 +125,9 @@ class Learn:
             console.print(f"Simulating {self.task} ...", highlight=False)
             held = max(self.trajectories // 8, 2)
             counts = (self.trajectories, held, held)
-            train, val, test = make_recordings(
+            train, val, test = make_data_sets(
                 truth,
-                [(jax.random.fold_in(jax.random.key(self.config.seed), k), count) for k, count in enumerate(counts)],
+                *((jax.random.fold_in(jax.random.key(self.config.seed), k), count) for k, count in enumerate(counts)),
                 contact_model=self.data_contact_model,
                 compensation_steps=self.config.compensation_steps,
             )

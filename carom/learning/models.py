@@ -35,7 +35,7 @@ class SegmentEnergy(eqx.Module):
     energy: Float[Array, ""]  # J
 
     @classmethod
-    def of(cls, skeleton: System, recording: Recording | None, dtype) -> "SegmentEnergy | None":
+    def of(cls, skeleton: System, recording: Recording | None) -> "SegmentEnergy | None":
         """Of all segments with a `StretchLimit`, scaled to the recorded motion; None if there are none."""
         ends, anchors = [], []
         for contact in skeleton.contacts:
@@ -47,7 +47,7 @@ class SegmentEnergy(eqx.Module):
             return None
         floats, count = skeleton.friction.dtype, len(ends)
         unit, zero = jnp.ones((), floats), jnp.zeros(count, floats)
-        new = cls(tuple(ends), jnp.zeros((count, 4), dtype), jnp.asarray(np.array(anchors), floats), zero, unit, unit)
+        new = cls(tuple(ends), jnp.zeros((count, 4), floats), jnp.asarray(np.array(anchors), floats), zero, unit, unit)
         if recording is None:
             return new
         length = np.asarray(jax.vmap(new.lengths)(jnp.asarray(recording.x[recording.valid], floats)))
@@ -66,22 +66,25 @@ class SegmentEnergy(eqx.Module):
 
     def __call__(self, x: Float[Array, "n 2"]) -> Float[Array, ""]:
         mean, spread, energy = (a.astype(x.dtype) for a in jax.lax.stop_gradient((self.mean, self.spread, self.energy)))
-        q = ((self.lengths(x) - mean) / spread).astype(self.coefficients.dtype)
+        q = (self.lengths(x) - mean) / spread
         powers = jnp.stack([q, q**2, q**3, q**4], axis=1)
-        return energy * jnp.sum(self.coefficients * powers).astype(x.dtype)
+        return energy * jnp.sum(self.coefficients.astype(x.dtype) * powers)
 
 
 class NeuralPotential(Potential):
-    """A potential energy learned as a multi-layer perceptron of all points, with softplus units.
+    """A potential energy learned as a multi-layer perceptron of all points, with softplus units, and a linear term.
 
-    Where chains may stretch, the elastic energy of their segments is added: see `SegmentEnergy`.
+    The linear term, `sum slope * x`, is a uniform field: what it explains, such as gravity, also holds where there were
+    no data, which is not so of a network. Where chains may stretch, the elastic energy of their segments is added: see
+    `SegmentEnergy`.
 
     **Arguments:** `n_points`, `dim`: of the system; `width`, `depth`: units of a hidden layer, number of hidden layers;
-    `key`: random key of the initial weights; `dtype`: of the weights and of the evaluation (single precision by
-    default, also inside of simulations in double); `segments`: elastic energy of segments, or `None`.
+    `key`: random key of the initial weights; `dtype`: of the network's weights and of its evaluation (single precision
+    by default, also inside of simulations in double); `segments`: elastic energy of segments, or `None`.
     """
 
     network: eqx.nn.MLP
+    slope: Float[Array, "n d"]  # N
     segments: SegmentEnergy | None
 
     def __init__(
@@ -98,6 +101,7 @@ class NeuralPotential(Potential):
         self.network = eqx.nn.MLP(
             n_points * dim, "scalar", width, depth, activation=jax.nn.softplus, key=key, dtype=dtype
         )
+        self.slope = jnp.zeros((n_points, dim))
         self.segments = segments
 
     @classmethod
@@ -105,21 +109,22 @@ class NeuralPotential(Potential):
         cls, skeleton: System, recording: Recording | None, *, key: PRNGKeyArray, dtype=jnp.float32, **sizes: int
     ) -> "NeuralPotential":
         """An untrained potential of a system, scaled to `recording` where there is one; `sizes`: width and depth."""
-        segments = SegmentEnergy.of(skeleton, recording, dtype)
+        segments = SegmentEnergy.of(skeleton, recording)
         return cls(skeleton.n_points, skeleton.dim, key=key, dtype=dtype, segments=segments, **sizes)
 
     def __call__(self, x, mass_matrix):
-        dtype = self.network.layers[0].weight.dtype
-        value = self.network(x.reshape(-1).astype(dtype)).astype(x.dtype)
+        inputs = x.reshape(-1).astype(self.network.layers[0].weight.dtype)
+        value = self.network(inputs).astype(x.dtype) + jnp.sum(self.slope.astype(x.dtype) * x)
         return value if self.segments is None else value + self.segments(x)
 
     def linear_weights(self) -> tuple[Any, ...]:
-        """The parameters in which the potential is linear: the output layer's weights, and those of the segments.
+        """The parameters in which the potential is linear: the output layer's weights first, then the linear term's and
+        those of the segments.
 
         Arrays, or what `equinox.tree_at` puts in their place.
         """
-        output = self.network.layers[-1].weight
-        return (output,) if self.segments is None else (output, self.segments.coefficients)
+        weights = self.network.layers[-1].weight, self.slope
+        return weights if self.segments is None else (*weights, self.segments.coefficients)
 
     def with_linear_weights(self, weights: tuple[Any, ...]) -> "NeuralPotential":
         """The potential with other values of `linear_weights`."""

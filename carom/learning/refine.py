@@ -50,6 +50,9 @@ class IdentifyConfig:
     """Most principal directions of the potential's forces to estimate along with the physical parameters."""
     smallest_force: float = 1e-5
     """Directions are left out whose root mean square force is less than this share of the largest."""
+    network: bool = True
+    """Estimate the output weights of the potential's network too; if not, they are 0, and the uniform field and the
+    energy of segments are all there is."""
     redescend: bool = True
     """Leave out steps that do not fit (see `robust.py`), and take errors to be of the size seen at the start.
     Otherwise steps that do not fit have less weight only, and errors are those left by the last round."""
@@ -113,18 +116,20 @@ class Problem:
     features: Float[np.ndarray, "W F"]
 
 
-def principal_forces(unknowns: Unknowns, recording: Recording, steps, *, most: int = 100, smallest: float = 1e-5):
-    """The principal directions (W, F) of the forces of a network's linear weights; F = 0 without a network.
+def principal_forces(unknowns: Unknowns, recording: Recording, steps, config: IdentifyConfig):
+    """The principal directions (W, F) of the forces of a potential's linear weights; F = 0 without a potential.
 
-    At most `most`, with a root mean square force of at least `smallest` of the largest one's.
+    At most `config.directions`, with a root mean square force of at least `smallest_force` of the largest one's.
     """
     if unknowns.potential is None:
         return np.zeros((0, 0))
     x = jnp.asarray(recording.x[steps[:, 0], steps[:, 1]][:: max(1, len(steps) // 500)])
-    forces = np.asarray(eqx.filter_jit(eqx.filter_vmap(force_features, in_axes=(None, 0)))(unknowns.potential, x))
+    forces = np.array(eqx.filter_jit(eqx.filter_vmap(force_features, in_axes=(None, 0)))(unknowns.potential, x))
     forces = forces.reshape(-1, forces.shape[-1])
+    if not config.network:
+        forces[:, : unknowns.potential.linear_weights()[0].size] = 0
     values, vectors = np.linalg.eigh(forces.T @ forces)
-    return vectors[:, values > smallest**2 * values[-1]][:, -most:]
+    return vectors[:, values > config.smallest_force**2 * values[-1]][:, -config.directions :]
 
 
 @eqx.filter_jit
@@ -158,7 +163,11 @@ def new_problem(
     steps, most = choose_steps(recording, system, config)
     # Room for as many contacts as the steps close at once, and two more for what the ballistic guess misses.
     skeleton = system.with_max_active(most + 2) if system.contacts else system
-    features = principal_forces(unknowns, recording, steps, most=config.directions, smallest=config.smallest_force)
+    if unknowns.potential is not None and not config.network:
+        output, *rest = unknowns.potential.linear_weights()
+        potential = unknowns.potential.with_linear_weights((jnp.zeros_like(output), *rest))
+        unknowns = eqx.tree_at(lambda u: u.potential, unknowns, potential)
+    features = principal_forces(unknowns, recording, steps, config)
     return Problem(unknowns, skeleton, stepper, recording, steps, features)
 
 
@@ -174,11 +183,16 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
     """Gauss-Newton steps from `problem.unknowns` to the parameters that fit the steps best."""
     unknowns, count = problem.unknowns, len(_vector(problem.unknowns))
 
-    def whole(physical, rest: float):
-        return np.concatenate([physical, np.full(problem.features.shape[1], rest)])
+    directions = problem.features.shape[1]
 
-    # A prior of standard deviation 1 on all physical parameters, which says nothing where data speak.
-    prior = whole(np.ones(count), _ridge(problem))
+    def whole(physical, rest: float):
+        return np.concatenate([physical, np.full(directions, rest)])
+
+    # A prior of standard deviation 1 on all physical parameters, which says nothing where data speak; and towards no
+    # network, where a uniform field and the energy of segments explain the data as well.
+    weights, ridge = _linear_weights(unknowns), _ridge(unknowns)
+    prior = np.eye(count + directions)
+    prior[count:, count:] = problem.features.T @ (ridge[:, None] * problem.features)
     most = whole(np.full(count, 0.5), np.inf)
     lower, upper = (whole(end, rest) for end, rest in zip(_bounds(unknowns), (-np.inf, np.inf), strict=True))
     changed = np.zeros(len(prior))
@@ -190,10 +204,12 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
         kept = kept & _finite(seen)
         seen = _those(seen, kept)
         now = whole(_vector(unknowns), 0.0)
+        pull = prior @ changed
+        pull[count:] += problem.features.T @ (ridge * weights)
         solution = solve(
             whitened(seen, problem, errors, kept),
             prior,
-            -changed,
+            pull,
             np.maximum(lower - now, -most),
             np.minimum(upper - now, most),
             redescend=config.redescend and k > 0,
@@ -208,7 +224,7 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
             errors = error_sizes(seen, problem.recording)
 
 
-POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=256, smallest_force=1e-7, redescend=False)
+POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=400, smallest_force=1e-7, redescend=False)
 """How a training refines, on the way and at its end.
 
 Steps that do not fit keep some weight: a model that is not there yet is not a wrong one.
@@ -227,10 +243,16 @@ def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
     return double and skeleton.n_points <= MOST_POINTS and not (networks or nothing)
 
 
-def polish(unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording) -> Unknowns | None:
-    """Learned unknowns that `can_be_refined`, refined; None where no recorded step starts without contact."""
-    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, POLISH)
-    return refine(problem, POLISH).unknowns if len(problem.steps) else None
+def polish(
+    unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording, *, network: bool = True
+) -> Unknowns | None:
+    """Learned unknowns that `can_be_refined`, refined; None where no recorded step starts without contact.
+
+    `network`: as in `IdentifyConfig`.
+    """
+    config = dataclasses.replace(POLISH, network=network)
+    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, config)
+    return refine(_within(problem), config).unknowns if len(problem.steps) else None
 
 
 def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivity:
@@ -242,12 +264,34 @@ def _settled(solution: Solution, count: int) -> bool:
     return bool(np.all(np.abs(solution.change[:count]) < 0.02 * errors))
 
 
-def _ridge(problem: Problem) -> float:
-    """Precision of the weights that are profiled out: they may change by as much as they are."""
-    if problem.unknowns.potential is None:
-        return 0.0
-    weights = [np.asarray(w, float).ravel() for w in problem.unknowns.potential.linear_weights()]
-    return float(1 / np.mean(np.concatenate(weights) ** 2))
+def _linear_weights(unknowns: Unknowns) -> Float[np.ndarray, " W"]:
+    """All weights in which the potential is linear; none without one."""
+    parts = () if unknowns.potential is None else unknowns.potential.linear_weights()
+    return np.concatenate([np.zeros(0), *(np.asarray(w, float).ravel() for w in parts)])
+
+
+_FREE = 1e-6
+"""Precision of the weights that are no network's, as a share of those that are."""
+
+
+def _ridge(unknowns: Unknowns) -> Float[np.ndarray, " W"]:
+    """Precision of the weights that are profiled out: those of the network are of the size that they begin with."""
+    if unknowns.potential is None:
+        return np.zeros(0)
+    weights = unknowns.potential.linear_weights()
+    output = weights[0].size
+    share = np.where(np.arange(sum(w.size for w in weights)) < output, 1.0, _FREE)
+    return 3 * output * share  # uniform within +-1 / sqrt(output)
+
+
+def _within(problem: Problem) -> Problem:
+    """The problem without the part of the weights that makes no force on the data to speak of: it would elsewhere."""
+    unknowns, features = problem.unknowns, problem.features
+    if unknowns.potential is None or features.shape[1] == POLISH.directions:
+        return problem
+    weights = _linear_weights(unknowns)
+    kept = features @ (features.T @ weights)
+    return dataclasses.replace(problem, unknowns=_with_weights(unknowns, kept - weights))
 
 
 PHYSICAL = {"log_mass_ratio": (-np.inf, np.inf), "friction": (0.0, np.inf), "restitution": (0.0, 1.0)}
@@ -279,13 +323,16 @@ def _moved(problem: Problem, change: Float[np.ndarray, " p"]) -> Unknowns:
     for name, part in _physical(out).items():
         value = jnp.asarray(part + change[first : first + len(part)], getattr(out, name).dtype)
         out, first = eqx.tree_at(lambda u, name=name: getattr(u, name), out, value), first + len(part)
-    if out.potential is None:
-        return out
-    old = out.potential.linear_weights()
-    ends = np.cumsum([w.size for w in old])[:-1]
-    by = np.split(problem.features @ change[first:], ends)
+    return out if out.potential is None else _with_weights(out, problem.features @ change[first:])
+
+
+def _with_weights(unknowns: Unknowns, change: Float[np.ndarray, " W"]) -> Unknowns:
+    """The unknowns with the potential's linear weights changed."""
+    assert unknowns.potential is not None
+    old = unknowns.potential.linear_weights()
+    by = np.split(change, np.cumsum([w.size for w in old])[:-1])
     new = tuple(jnp.asarray(np.asarray(w, float) + d.reshape(w.shape), w.dtype) for w, d in zip(old, by, strict=True))
-    return eqx.tree_at(lambda u: u.potential, out, out.potential.with_linear_weights(new))
+    return eqx.tree_at(lambda u: u.potential, unknowns, unknowns.potential.with_linear_weights(new))
 
 
 def error_sizes(seen: StepSensitivity, recording: Recording) -> Float[np.ndarray, " R"]:

@@ -42,8 +42,8 @@ class Solution(NamedTuple):
 
 def solve(
     blocks: Blocks,
-    prior: Float[np.ndarray, " p"],
-    centre: Float[np.ndarray, " p"],
+    prior: Float[np.ndarray, "p p"],
+    pull: Float[np.ndarray, " p"],
     lower: Float[np.ndarray, " p"],
     upper: Float[np.ndarray, " p"],
     *,
@@ -52,16 +52,16 @@ def solve(
 ) -> Solution:
     """Iteratively reweighted least squares on one linearisation `u + J change`, within bounds on the change.
 
-    `prior` (p,) is the precision of a weak prior around the change `centre`, which decides where the data do not.
+    A weak prior decides where the data do not: `prior` is its precision, `pull` its gradient where nothing changes.
     """
-    change = np.zeros(len(prior))
+    change = np.zeros(len(pull))
     for k in range(rounds):
         u = blocks.residual + blocks.jacobian @ change
         distance, size = _distance(u, blocks.kind)
         weight = _redescending(distance) if redescend and k >= rounds // 3 else _huber(distance)
         weighted = weight / size
         H, g = _normal_equations(blocks, weighted, u)
-        target = _step(H + np.diag(prior), g + prior * (change - centre), change, lower, upper)
+        target = _step(H + prior, g + pull + prior @ change, change, lower, upper)
         moved, change = np.abs(target - change).max(initial=0.0), target
         if moved < 1e-8 and k > rounds // 3:
             break
@@ -119,7 +119,7 @@ def _standard_errors(blocks: Blocks, u, distance, size, prior):
     q = u.shape[1]
     weight = _redescending(distance)
     bread = np.maximum(weight - 4 * distance / (CUTOFF * q) * (1 + distance / CUTOFF) ** -3, 0) / size
-    inverse = np.linalg.inv(_normal_equations(blocks, bread, u)[0] + np.diag(prior))
+    inverse = np.linalg.inv(_normal_equations(blocks, bread, u)[0] + prior)
     influence = np.einsum("nqp,nq->np", blocks.jacobian, u * (weight / size)[:, None]) @ inverse
     clusters, index = np.unique(blocks.cluster, return_inverse=True)
     total = np.zeros((len(clusters), influence.shape[1]))
@@ -129,5 +129,5 @@ def _standard_errors(blocks: Blocks, u, distance, size, prior):
     for k in np.unique(blocks.kind):
         same = blocks.kind == k
         spread[same] = np.mean(weight[same] ** 2 * distance[same]) / size[same]
-    expected = inverse @ (_normal_equations(blocks, spread, u)[0] + np.diag(prior)) @ inverse
+    expected = inverse @ (_normal_equations(blocks, spread, u)[0] + prior) @ inverse
     return np.sqrt(np.maximum(sandwich, np.diag(expected)))

@@ -323,11 +323,17 @@ def learn(
         return bool(state.settled) and int(state.best_epoch) == refine_at
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
-        """Unknowns that validate better than these, and how well they do."""
+        """Unknowns that validate better than these, and how well they do: without a network, where that is as good."""
         shown.say("refining ...")
-        new = polish(unknowns, trained, stepper, train)
-        new_loss = np.inf if new is None else float(validate(new, trained, *held_out, stepper))
-        return (new, new_loss) if new is not None and new_loss < val_loss else None
+        best = None
+        for network in (False, True) if unknowns.potential is not None else (True,):
+            new = polish(unknowns, trained, stepper, train, network=network)
+            new_loss = np.inf if new is None else float(validate(new, trained, *held_out, stepper))
+            if new is not None and new_loss < val_loss:
+                best, val_loss = (new, new_loss), new_loss
+            if new_loss <= config.enough * speed:
+                break
+        return best
 
     with LoopProgress("epoch", config.epochs, int(state.epoch), shown=progress) as shown:
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):

@@ -19,6 +19,7 @@ from carom.system import System
 from carom.tasks.base import Task as Task
 from carom.tasks.base import find_named
 from carom.tasks.bouncing import BP5, BP5_E
+from carom.tasks.cubes import CUBE
 from carom.tasks.disks import BD5, BILLIARDS, THROW
 from carom.tasks.gyroscopes import GYRO, GYRO_E
 from carom.tasks.impacts import BOUNCE_ONCE, GROUND_WALL, TWO_BALLS
@@ -26,7 +27,9 @@ from carom.tasks.pendulums import CP3, CP3_E
 from carom.tasks.ropes import ROPE, ROPE_50, ROPE_100, ROPE_200
 
 _PAPER = (BP5_E, BP5, BD5, CP3, CP3_E, GYRO, GYRO_E, ROPE, ROPE_50, ROPE_100, ROPE_200)
-TASKS: dict[str, Task] = {task.name: task for task in (*_PAPER, BILLIARDS, THROW, BOUNCE_ONCE, GROUND_WALL, TWO_BALLS)}
+TASKS: dict[str, Task] = {
+    task.name: task for task in (*_PAPER, BILLIARDS, THROW, BOUNCE_ONCE, GROUND_WALL, TWO_BALLS, CUBE)
+}
 
 
 def find_task(name: str) -> Task:
@@ -82,23 +85,49 @@ def make_recordings(
     system: System,
     parts: Sequence[tuple[PRNGKeyArray, int]],
     *,
+    steps: int | None = None,
     contact_model: str | ContactModel | None = None,
     compensation_steps: float | None = COMPENSATION_STEPS,
 ) -> list[Recording]:
     """Several recordings, each as by `make_recording` from its key and number, in one simulation.
 
-    The program that simulates is compiled once for each number of trajectories, which takes longer than to run it.
+    `steps`: how long they are, if not as the task says. The program that simulates is compiled once for each number of
+    trajectories, which takes longer than to run it.
     """
     x0, v0 = (jnp.concatenate(states) for states in zip(*(sample(system, *part) for part in parts), strict=True))
     if contact_model is not None:
         system = system.with_contact_model(contact_model)
     chosen = find_task(system.name)
-    trajectory = simulate(system, x0, v0, dt=chosen.dt, steps=chosen.steps, compensation_steps=compensation_steps)
+    steps = chosen.steps if steps is None else steps
+    trajectory = simulate(system, x0, v0, dt=chosen.dt, steps=steps, compensation_steps=compensation_steps)
     model = contact_model_name(system.contact_model)
     source = "carom" if model == "cm" else f"carom, contact model {model or 'of its own'}"
     whole = recording_of(trajectory, task=system.name, source=source)
     ends = np.cumsum([n for _, n in parts])
     return [whole.select(np.arange(end - n, end)) for end, (_, n) in zip(ends, parts, strict=True)]
+
+
+LEAST_TEST_STEPS = 100
+"""Predictions are measured over so many steps, also where a task's trajectories are shorter."""
+
+
+def make_data_sets(
+    system: System,
+    train: tuple[PRNGKeyArray, int],
+    val: tuple[PRNGKeyArray, int],
+    test: tuple[PRNGKeyArray, int],
+    **how,
+) -> list[Recording]:
+    """Recordings to train, validate and test with, the last of at least `LEAST_TEST_STEPS` steps.
+
+    **Arguments:** as those of `make_recordings`.
+    """
+    if find_task(system.name).steps >= LEAST_TEST_STEPS:
+        return make_recordings(system, [train, val, test], **how)
+    return [
+        *make_recordings(system, [train, val], **how),
+        *make_recordings(system, [test], steps=LEAST_TEST_STEPS, **how),
+    ]
 
 
 def load_model(path: str | os.PathLike, skeleton: System | None = None) -> System:
