@@ -208,3 +208,18 @@ def test_robust_least_squares_ignores_outliers_and_knows_its_error():
     assert blocks is not None
     held = solve(blocks, np.eye(3), np.zeros(3), np.array([-1, -0.2, -1.0]), np.ones(3), redescend=True)
     assert held.change[1] == -0.2
+
+
+def test_what_nearly_exact_data_do_not_tell_is_left_to_the_prior():
+    """Only the sum of the last two parameters has an effect, with errors so small that rounding hides the prior."""
+    rng = np.random.default_rng(1)
+    J = rng.normal(size=(300, 4, 3))
+    J[..., 2] = J[..., 1]
+    true, errors = np.array([0.3, 0.2, 0.0]), 1e-9
+    u = (-J @ true) / errors + rng.normal(size=(300, 4))
+    blocks = Blocks(u, J / errors, np.arange(300), np.zeros(300, int))
+    out = solve(blocks, np.eye(3), np.zeros(3), np.full(3, -9.0), np.full(3, 9.0), redescend=True)
+    assert np.isclose(out.change[0], 0.3, atol=1e-9)
+    assert np.isclose(out.change[1] + out.change[2], 0.2, atol=1e-7)
+    assert out.standard_error[0] < 1e-9
+    assert np.allclose(out.standard_error[1:], 0.5**0.5, rtol=0.01)

@@ -126,6 +126,19 @@ class NeuralPotential(Potential):
         weights = self.network.layers[-1].weight, self.slope
         return weights if self.segments is None else (*weights, self.segments.coefficients)
 
+    def simpler(self) -> list[np.ndarray]:
+        """Which of all linear weights simpler potentials have, the simplest first (flags, flat).
+
+        A uniform field and linear springs; the same with the whole energy of segments; neither has the network.
+        """
+        output, *rest = self.linear_weights()
+        whole = np.repeat([False, True], [output.size, sum(w.size for w in rest)])
+        if self.segments is None:
+            return [whole]
+        linear = whole.copy()
+        linear[-self.segments.coefficients.size :] = np.tile([True, True, False, False], len(self.segments.ends))
+        return [linear, whole]
+
     def with_linear_weights(self, weights: tuple[Any, ...]) -> "NeuralPotential":
         """The potential with other values of `linear_weights`."""
         return eqx.tree_at(lambda p: p.linear_weights(), self, weights)

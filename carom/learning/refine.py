@@ -50,9 +50,6 @@ class IdentifyConfig:
     """Most principal directions of the potential's forces to estimate along with the physical parameters."""
     smallest_force: float = 1e-5
     """Directions are left out whose root mean square force is less than this share of the largest."""
-    network: bool = True
-    """Estimate the output weights of the potential's network too; if not, they are 0, and the uniform field and the
-    energy of segments are all there is."""
     redescend: bool = True
     """Leave out steps that do not fit (see `robust.py`), and take errors to be of the size seen at the start.
     Otherwise steps that do not fit have less weight only, and errors are those left by the last round."""
@@ -116,18 +113,21 @@ class Problem:
     features: Float[np.ndarray, "W F"]
 
 
-def principal_forces(unknowns: Unknowns, recording: Recording, steps, config: IdentifyConfig):
+def principal_forces(
+    unknowns: Unknowns, recording: Recording, steps, config: IdentifyConfig, weights: Bool[np.ndarray, " W"] | None
+):
     """The principal directions (W, F) of the forces of a potential's linear weights; F = 0 without a potential.
 
-    At most `config.directions`, with a root mean square force of at least `smallest_force` of the largest one's.
+    Of all of them, or of the `weights` that are flagged. At most `config.directions`, with a root mean square force of
+    at least `smallest_force` of the largest one's.
     """
     if unknowns.potential is None:
         return np.zeros((0, 0))
     x = jnp.asarray(recording.x[steps[:, 0], steps[:, 1]][:: max(1, len(steps) // 500)])
     forces = np.array(eqx.filter_jit(eqx.filter_vmap(force_features, in_axes=(None, 0)))(unknowns.potential, x))
     forces = forces.reshape(-1, forces.shape[-1])
-    if not config.network:
-        forces[:, : unknowns.potential.linear_weights()[0].size] = 0
+    if weights is not None:
+        forces[:, ~weights] = 0
     values, vectors = np.linalg.eigh(forces.T @ forces)
     return vectors[:, values > config.smallest_force**2 * values[-1]][:, -config.directions :]
 
@@ -157,17 +157,23 @@ def sensitivities(problem: Problem, unknowns: Unknowns) -> StepSensitivity:
 
 
 def new_problem(
-    unknowns: Unknowns, system: System, stepper: Stepper, recording: Recording, config: IdentifyConfig
+    unknowns: Unknowns,
+    system: System,
+    stepper: Stepper,
+    recording: Recording,
+    config: IdentifyConfig,
+    weights: Bool[np.ndarray, " W"] | None = None,
 ) -> Problem:
-    """Chooses the steps of `recording` to look at, none of which starts in contact, and the forces that may change."""
+    """Chooses the steps of `recording` to look at, none of which starts in contact, and the forces that may change.
+
+    `weights`: which linear weights of the potential take part, if not all; the others become 0.
+    """
     steps, most = choose_steps(recording, system, config)
     # Room for as many contacts as the steps close at once, and two more for what the ballistic guess misses.
     skeleton = system.with_max_active(most + 2) if system.contacts else system
-    if unknowns.potential is not None and not config.network:
-        output, *rest = unknowns.potential.linear_weights()
-        potential = unknowns.potential.with_linear_weights((jnp.zeros_like(output), *rest))
-        unknowns = eqx.tree_at(lambda u: u.potential, unknowns, potential)
-    features = principal_forces(unknowns, recording, steps, config)
+    if unknowns.potential is not None and weights is not None:
+        unknowns = _with_weights(unknowns, np.where(weights, 0, -_linear_weights(unknowns)))
+    features = principal_forces(unknowns, recording, steps, config, weights)
     return Problem(unknowns, skeleton, stepper, recording, steps, features)
 
 
@@ -224,7 +230,7 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
             errors = error_sizes(seen, problem.recording)
 
 
-POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=400, smallest_force=1e-7, redescend=False)
+POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=8, directions=400, smallest_force=1e-7, redescend=False)
 """How a training refines, on the way and at its end.
 
 Steps that do not fit keep some weight: a model that is not there yet is not a wrong one.
@@ -244,15 +250,18 @@ def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
 
 
 def polish(
-    unknowns: Unknowns, skeleton: System, stepper: Stepper, recording: Recording, *, network: bool = True
+    unknowns: Unknowns,
+    skeleton: System,
+    stepper: Stepper,
+    recording: Recording,
+    weights: Bool[np.ndarray, " W"] | None = None,
 ) -> Unknowns | None:
     """Learned unknowns that `can_be_refined`, refined; None where no recorded step starts without contact.
 
-    `network`: as in `IdentifyConfig`.
+    `weights`: which linear weights of the potential it has, if not all.
     """
-    config = dataclasses.replace(POLISH, network=network)
-    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, config)
-    return refine(_within(problem), config).unknowns if len(problem.steps) else None
+    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, POLISH, weights)
+    return refine(_within(problem), POLISH).unknowns if len(problem.steps) else None
 
 
 def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivity:

@@ -61,7 +61,7 @@ def solve(
         weight = _redescending(distance) if redescend and k >= rounds // 3 else _huber(distance)
         weighted = weight / size
         H, g = _normal_equations(blocks, weighted, u)
-        target = _step(H + prior, g + pull + prior @ change, change, lower, upper)
+        target = _step(H, g, prior, pull + prior @ change, change, lower, upper)
         moved, change = np.abs(target - change).max(initial=0.0), target
         if moved < 1e-8 and k > rounds // 3:
             break
@@ -98,15 +98,34 @@ def _normal_equations(blocks: Blocks, weight, u):
     return J.T @ J, J.T @ (u * root).reshape(n * q)
 
 
-def _step(H, g, change, lower, upper):
+_LOST = 1e-14
+"""Curvature below this share of the largest, times the number of parameters, is lost in rounding."""
+
+
+def _spectrum(H, prior):
+    """Directions (columns, not of unit length) in which `H + prior` is diagonal, its curvatures, and where H is lost.
+
+    There the prior decides alone: rounding of data that are almost exact is greater than all that it says.
+    """
+    scale = 1 / np.sqrt(np.diag(H + prior))
+    values, vectors = np.linalg.eigh(scale[:, None] * (H + prior) * scale)
+    directions = scale[:, None] * vectors
+    lost = values <= _LOST * len(values) * values[-1]
+    alone = np.einsum("ik,ij,jk->k", directions, prior, directions)
+    return directions, np.where(lost, np.maximum(alone, 1e-300), values), lost
+
+
+def _step(H, g, prior, pull, change, lower, upper):
     """Minimiser of the quadratic model, with those that would leave their bounds held there."""
     held: Bool[np.ndarray, " p"] = np.zeros(len(g), bool)
     target = change
     for _ in range(5):
         fixed = np.where(held, np.clip(target, lower, upper) - change, 0)
         free = ~held
+        directions, curvature, lost = _spectrum(H[np.ix_(free, free)], prior[np.ix_(free, free)])
+        told, asked = ((slope + matrix @ fixed)[free] for slope, matrix in ((g, H), (pull, prior)))
         delta = fixed.copy()
-        delta[free] = -np.linalg.solve(H[np.ix_(free, free)], (g + H @ fixed)[free])
+        delta[free] = -directions @ ((np.where(lost, 0, told @ directions) + asked @ directions) / curvature)
         target = change + delta
         outside = ~held & ((target < lower) | (target > upper))
         if not outside.any():
@@ -119,8 +138,9 @@ def _standard_errors(blocks: Blocks, u, distance, size, prior):
     q = u.shape[1]
     weight = _redescending(distance)
     bread = np.maximum(weight - 4 * distance / (CUTOFF * q) * (1 + distance / CUTOFF) ** -3, 0) / size
-    inverse = np.linalg.inv(_normal_equations(blocks, bread, u)[0] + prior)
-    influence = np.einsum("nqp,nq->np", blocks.jacobian, u * (weight / size)[:, None]) @ inverse
+    directions, curvature, lost = _spectrum(_normal_equations(blocks, bread, u)[0], prior)
+    inverse, told = ((directions / part) @ directions.T for part in (curvature, np.where(lost, np.inf, curvature)))
+    influence = np.einsum("nqp,nq->np", blocks.jacobian, u * (weight / size)[:, None]) @ told
     clusters, index = np.unique(blocks.cluster, return_inverse=True)
     total = np.zeros((len(clusters), influence.shape[1]))
     np.add.at(total, index, influence)
@@ -129,5 +149,5 @@ def _standard_errors(blocks: Blocks, u, distance, size, prior):
     for k in np.unique(blocks.kind):
         same = blocks.kind == k
         spread[same] = np.mean(weight[same] ** 2 * distance[same]) / size[same]
-    expected = inverse @ (_normal_equations(blocks, spread, u)[0] + prior) @ inverse
+    expected = told @ _normal_equations(blocks, spread, u)[0] @ told + inverse @ prior @ inverse
     return np.sqrt(np.maximum(sandwich, np.diag(expected)))

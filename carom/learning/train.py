@@ -323,11 +323,11 @@ def learn(
         return bool(state.settled) and int(state.best_epoch) == refine_at
 
     def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
-        """Unknowns that validate better than these, and how well they do: without a network, where that is as good."""
+        """Unknowns that validate better than these, and how well they do: the simplest potential that is enough."""
         shown.say("refining ...")
         best = None
-        for network in (False, True) if unknowns.potential is not None else (True,):
-            new = polish(unknowns, trained, stepper, train, network=network)
+        for weights in (*([] if unknowns.potential is None else unknowns.potential.simpler()), None):
+            new = polish(unknowns, trained, stepper, train, weights)
             new_loss = np.inf if new is None else float(validate(new, trained, *held_out, stepper))
             if new is not None and new_loss < val_loss:
                 best, val_loss = (new, new_loss), new_loss
