@@ -112,7 +112,7 @@ def test_segments_without_recordings_or_limits(cp3):
 
 def test_a_model_with_segments_comes_back_from_its_file(tmp_path):
     rope, potential, x = rope_potential()
-    potential = eqx.tree_at(lambda p: p.segments.coefficients, potential, jnp.ones((10, 4), jnp.float32))
+    potential = eqx.tree_at(lambda p: p.segments.coefficients, potential, jnp.ones((10, 4)))
     system = Unknowns(None, None, None, potential).assemble(rope)
     carom.save_model(tmp_path / "model.carom", system)
     again = carom.load_model(tmp_path / "model.carom")

@@ -230,7 +230,7 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
             errors = error_sizes(seen, problem.recording)
 
 
-POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=8, directions=400, smallest_force=1e-7, redescend=False)
+POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=400, smallest_force=1e-7, redescend=False)
 """How a training refines, on the way and at its end.
 
 Steps that do not fit keep some weight: a model that is not there yet is not a wrong one.

@@ -122,7 +122,7 @@ def force_features(potential: NeuralPotential | None, x: Float[Array, "n d"]) ->
         return potential.with_linear_weights(weights)(x, jnp.zeros((0, 0), x.dtype))
 
     def slope(x):
-        return jnp.concatenate([g.reshape(-1) for g in jax.grad(value, argnums=1)(x, weights)])
+        return jnp.concatenate([g.reshape(-1).astype(x.dtype) for g in jax.grad(value, argnums=1)(x, weights)])
 
     force = -jax.jacfwd(slope)(x).reshape(-1, x.size).T
     return force.astype(x.dtype)
