@@ -9,12 +9,14 @@ from carom.learning.dataset import Dataset
 from carom.learning.evaluate import evaluate
 from carom.learning.models import mass_ratios
 from carom.learning.train import learn
+from carom.tasks import make_data_sets
 
 
 def full_dataset(task, *, n=800, seed=0):
     system = carom.task(task)
-    train, val = (carom.make_recording(system, jax.random.key(seed + k), count) for k, count in enumerate((n, n // 8)))
-    return system, Dataset(train, val)
+    parts = ((jax.random.key(seed + k), count) for k, count in enumerate((n, n // 8, 100)))
+    train, val, test = make_data_sets(system, *parts)
+    return system, Dataset(train, val), test
 
 
 def check_learned(system, truth, *, properties=1e-3, masses=1e-3):
@@ -27,10 +29,10 @@ def check_learned(system, truth, *, properties=1e-3, masses=1e-3):
 @pytest.mark.ci_budget
 @pytest.mark.timeout(800)
 def test_cp3_is_learned_from_its_own_data():
-    truth, dataset = full_dataset("cp3")
+    truth, dataset, test = full_dataset("cp3")
     system, _ = learn(truth, dataset, progress=False)
     check_learned(system, truth)
-    measures, _ = evaluate(system, carom.make_recording(truth, jax.random.key(2), 100), truth=truth)
+    measures, _ = evaluate(system, test, truth=truth)
     assert measures["trajectory_error"] < 1e-4  # the paper: 2e-5
 
 
@@ -42,7 +44,7 @@ def test_cp3_is_learned_from_its_own_data():
     ids=["cp3-e", "bp5-e", "cp3 Hamiltonian"],
 )
 def test_elastic_tasks_and_the_hamiltonian_network(task, model):
-    truth, dataset = full_dataset(task)
+    truth, dataset, _ = full_dataset(task)
     system, _ = learn(truth, dataset, carom.LearnConfig(model=model), progress=False)
     check_learned(system, truth)
 
@@ -59,8 +61,8 @@ def test_cp3_is_learned_from_recordings_carom_did_not_make(reference_dir):
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 def test_the_springs_of_a_rope_are_learned():
-    truth, dataset = full_dataset("rope")
+    truth, dataset, test = full_dataset("rope")
     system, _ = learn(truth, dataset, progress=False)
     check_learned(system, truth, properties=5e-3, masses=2e-3)
-    measures, _ = evaluate(system, carom.make_recording(truth, jax.random.key(2), 100), truth=truth)
+    measures, _ = evaluate(system, test, truth=truth)
     assert measures["trajectory_error"] < 2e-3

@@ -73,7 +73,7 @@ def _told(estimate: Estimate) -> tuple[str, str, str]:
         return impacts, "", f">= {estimate.bound:.3f}"
     if estimate.verdict == "bounded above":
         return impacts, "", f"<= {estimate.bound:.3f}"
-    interval = f"{estimate.value:.4f} +- {1.96 * estimate.standard_error:.1g}"
+    interval = f"{max(estimate.value, 0.0):.4f} +- {1.96 * estimate.standard_error:.1g}"  # never -0.0000
     return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
 
 

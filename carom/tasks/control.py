@@ -288,7 +288,7 @@ def optimize(
                 f"the loss or its gradient is not finite in iteration {k} (loss {loss}). Use a smaller learning_rate, "
                 "or another start.",
             )
-            if run is not None and k % CHECKPOINT_EVERY == 0 and k > len(rows) - 1 > 0:
+            if run is not None and k > 0 and k % CHECKPOINT_EVERY == 0:
                 run.save_checkpoint(k, state)
             rows.append({"epoch": k, "loss": loss, "miss": float(now.miss)})
             if run is not None:
@@ -299,7 +299,7 @@ def optimize(
             if k == config.iterations or enough:
                 break
             if int(state.since) >= config.patience:
-                shown.say("looking for another start ...")
+                shown.say("the loss no longer falls ...")
                 choice = control.scout(jax.random.fold_in(key, k), play)
                 if choice is None:
                     break
