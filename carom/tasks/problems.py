@@ -16,11 +16,6 @@ from carom.tasks.impacts import BOUNCE_ONCE, GROUND_WALL, TWO_BALLS
 Point = tuple[float, float]
 
 
-def distance(a: Float[Array, "2"], b: Float[Array, "2"]) -> Float[Array, ""]:
-    """Between two places (m)."""
-    return jnp.sqrt(jnp.sum((a - b) ** 2))
-
-
 class Aim(Control):
     """The velocity with which one ball, from a given place, is at another place at the end (Zhong et al., 1 and 3)."""
 
@@ -45,7 +40,7 @@ class Aim(Control):
         return jnp.sum((motion.x[-1, 0] - jnp.asarray(self.aim)) ** 2)
 
     def miss(self, motion):
-        return distance(motion.x[-1, 0], jnp.asarray(self.aim))
+        return jnp.linalg.norm(motion.x[-1, 0] - jnp.asarray(self.aim))
 
     def scout(self, key, play):
         return None
@@ -81,7 +76,7 @@ class TwoBalls(Control):
         return jnp.sum(motion.x[-1, 1] ** 2) + self.weight * self.dt * jnp.sum(choice["force"] ** 2)
 
     def miss(self, motion):
-        return distance(motion.x[-1, 1], jnp.zeros(2))
+        return jnp.linalg.norm(motion.x[-1, 1])
 
     def scout(self, key, play):
         return None
@@ -121,7 +116,7 @@ class Billiards(Control):
         return jnp.sum((motion.x[-1, -1] - jnp.asarray(self.aim)) ** 2)
 
     def miss(self, motion):
-        return distance(motion.x[-1, -1], jnp.asarray(self.aim))
+        return jnp.linalg.norm(motion.x[-1, -1] - jnp.asarray(self.aim))
 
     def scout(self, key, play):
         where, ball, aside, speed = jax.random.split(key, 4)
@@ -208,7 +203,7 @@ class ThrowHit(Control):
         return jnp.sum((self.landing(motion) - jnp.asarray(self.aim)) ** 2)
 
     def miss(self, motion):
-        return distance(self.landing(motion), jnp.asarray(self.aim))
+        return jnp.linalg.norm(self.landing(motion) - jnp.asarray(self.aim))
 
     def scout(self, key, play):
         return None
