@@ -104,14 +104,37 @@ def test_the_elastic_energy_of_segments_holds_springs():
     assert np.allclose(forces, jax.jit(jax.vmap(jax.grad(lambda x: springs(x, rope.mass_matrix()))))(x), atol=1e-10)
 
 
+def test_simpler_potentials_have_fewer_parameters_and_come_back_to_the_whole_one():
+    _, potential, x = rope_potential()
+    state, rng = x[5], np.random.default_rng(0)
+    linear, bare = potential.simpler()
+    assert [p.network for p in (linear, bare)] == [None, None]
+    assert [p.segments.coefficients.shape for p in (linear, bare)] == [(10, 2), (10, 4)]
+    assert bare.simpler() == []
+    for simple in (linear, bare):
+        simple = simple.with_linear_weights(
+            tuple(jnp.asarray(rng.normal(size=w.shape)) for w in simple.linear_weights())
+        )
+        force = jax.grad(simple)(state, jnp.eye(10))
+        whole = simple.extended(potential)
+        assert jax.tree.structure(whole) == jax.tree.structure(potential)
+        assert np.any(np.asarray(whole.network.layers[0].weight))  # it can be learned on
+        assert np.allclose(jax.grad(whole)(state, jnp.eye(10)), force, atol=1e-12)
+        assert whole.pruned().network is None
+        assert np.allclose(jax.grad(whole.pruned())(state, jnp.eye(10)), force, atol=1e-12)
+    assert potential.pruned() is potential
+
+
 def test_segments_without_recordings_or_limits(cp3):
     assert NeuralPotential.of(cp3, None, key=jax.random.key(0), width=8, depth=2).segments is None
     hung = NeuralPotential.of(carom.task("rope"), None, key=jax.random.key(0), width=8, depth=2)
     assert np.isfinite(eqx.filter_jit(hung)(jnp.asarray(np.linspace(0.1, 1, 20).reshape(10, 2)), jnp.eye(10)))
 
 
-def test_a_model_with_segments_comes_back_from_its_file(tmp_path):
+@pytest.mark.parametrize("network", [True, False])
+def test_a_model_with_segments_comes_back_from_its_file(tmp_path, network):
     rope, potential, x = rope_potential()
+    potential = potential if network else potential.simpler()[-1]
     potential = eqx.tree_at(lambda p: p.segments.coefficients, potential, jnp.ones((10, 4)))
     system = Unknowns(None, None, None, potential).assemble(rope)
     carom.save_model(tmp_path / "model.carom", system)

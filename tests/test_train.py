@@ -47,8 +47,13 @@ def test_learning_lowers_the_loss_and_reports_it(cp3, cp3_data, tmp_path):
     assert not np.allclose(numbers(system), numbers(cp3), atol=1e-2)
 
 
-def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path):
-    config = dataclasses.replace(TINY, refine=True)  # after epoch 2, and at the end
+def epochs_of(run):
+    return [m["epoch"] for m in run.metrics() if "refinement" not in m]
+
+
+@pytest.mark.parametrize("when", [{"refinement": 2}, {"epoch": 3}])
+def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path, when):
+    config = dataclasses.replace(TINY, refine=True, enough=0.0)  # before epoch 1, after epoch 2, and at the end
     whole = RunFolder.create(tmp_path / "whole", {})
     expected, _ = learn(cp3, cp3_data, config, run=whole, progress=False)
     whole.close()
@@ -59,7 +64,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path)
     class Dying(RunFolder):
         def log(self, metrics):
             super().log(metrics)
-            if metrics["epoch"] == 3:
+            if when.items() <= metrics.items():
                 raise KilledError
 
     dying = Dying.create(tmp_path / "killed", {})
@@ -67,26 +72,29 @@ def test_a_resumed_training_equals_an_uninterrupted_one(cp3, cp3_data, tmp_path)
         learn(cp3, cp3_data, config, run=dying, progress=False)
     dying.close()
     again = RunFolder.open(tmp_path / "killed")
-    assert again.metrics()[-1]["epoch"] == 3  # logged, but its checkpoint was not written
+    assert when.items() <= again.metrics()[-1].items()  # logged, but its checkpoint was not written
     system, report = learn(cp3, cp3_data, config, run=again, progress=False)
     again.close()
     assert report.epochs == 4
-    assert [m["epoch"] for m in again.metrics()] == [1, 2, 3, 4]
+    assert epochs_of(again) == [1, 2, 3, 4]
     assert np.array_equal(numbers(system), numbers(expected))
     assert [m["val_loss"] for m in again.metrics()] == [m["val_loss"] for m in whole.metrics()]
 
 
 def test_a_refinement_can_be_enough(cp3, cp3_data, tmp_path):
-    config = dataclasses.replace(TINY, refine=True, enough=np.inf)
+    config = dataclasses.replace(TINY, refine=True, enough=1e-2)
     run = RunFolder.create(tmp_path / "run", {})
     system, report = learn(cp3, cp3_data, config, run=run, progress=False)
     run.close()
-    assert (report.epochs, report.stopped_early, report.refined) == (2, True, True)
-    assert report.val_loss <= run.metrics()[-1]["val_loss"]
+    assert (report.epochs, report.stopped_early, report.refined, report.train_loss) == (0, True, True, None)
+    assert report.val_loss <= min(m["val_loss"] for m in run.metrics())
+    assert epochs_of(run) == []
+    assert np.abs(numbers(system) - numbers(cp3)).max() < 1e-2
+    assert system.potential.network is None  # gravity is a uniform field
     again = RunFolder.open(tmp_path / "run")
     resumed, report = learn(cp3, cp3_data, config, run=again, progress=False)
     again.close()
-    assert (report.epochs, report.stopped_early, report.refined) == (2, True, True)
+    assert (report.epochs, report.stopped_early, report.refined) == (0, True, True)
     assert np.array_equal(numbers(resumed), numbers(system))
 
 

@@ -169,6 +169,8 @@ class Learn:
         seconds = f"{report.seconds:.0f} s for {report.epochs} epochs" + (
             ", stopped early" if report.stopped_early else ""
         )
+        if not report.epochs:
+            seconds = f"{report.seconds:.0f} s; Gauss-Newton steps were enough, no epoch was needed"
         console.print(f"Done ({seconds}). Everything is in {run.path}", soft_wrap=True, highlight=False)
 
 

@@ -50,10 +50,11 @@ class LearnConfig:
     patience: int = 200
     """Stop after so many epochs without a better validation loss."""
     refine: bool = True
-    """Refine masses, contact properties and the potential's linear weights by Gauss-Newton steps, on the way and at the
-    end; the result is kept if it validates better. For systems of up to 40 points, not for baselines."""
+    """Refine masses, contact properties and the potential's linear weights by Gauss-Newton steps: before the first
+    epoch, on the way and at the end. What validates better is kept. For up to 40 points, not for baselines."""
     enough: float = 1e-4
-    """Stop after the first refinement if the validation loss is then below this share of the data's speed."""
+    """Stop after a refinement if nine tenths of the validation chunks are then predicted with a mean error below this
+    share of the data's speed."""
     width: int = 256
     """Units in a hidden layer of the potential, and of the contact network of mlp-cd-clnn."""
     depth: int = 3

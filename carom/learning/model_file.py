@@ -49,11 +49,14 @@ def save_model(
             "name": contact_model_name(system.contact_model),
             **contact_model_settings(system.contact_model),
         },
+        "potential": None,
         "network": None,
         "baseline": describe_baseline(system),
         "sha256": hashlib.sha256(payload).hexdigest(),
     }
     if isinstance(system.potential, NeuralPotential):
+        header["potential"] = "learned"
+    if isinstance(system.potential, NeuralPotential) and system.potential.network is not None:
         network = system.potential.network
         header["network"] = {
             "width": network.width_size,
@@ -82,16 +85,13 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
         f"the model {path} is of a system with {shape[0]} points in {shape[1]}D; the skeleton has "
         f"{skeleton.n_points} in {skeleton.dim}D. Give the skeleton it was learned with.",
     )
-    if header["network"] is not None:
-        network = header["network"]
-        potential = NeuralPotential.of(
-            skeleton,
-            None,
-            width=network["width"],
-            depth=network["depth"],
-            dtype=jnp.dtype(network["dtype"]),
-            key=jax.random.key(0),
-        )
+    network = header["network"]
+    if network is not None or header.get("potential") == "learned":
+        sizes = {} if network is None else {"width": network["width"], "depth": network["depth"]}
+        dtype = jnp.float32 if network is None else jnp.dtype(network["dtype"])
+        potential = NeuralPotential.of(skeleton, None, dtype=dtype, key=jax.random.key(0), **sizes)
+        if network is None:
+            potential = eqx.tree_at(lambda p: p.network, potential, None)
         skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)
     skeleton = skeleton.with_contact_model(_contact_model(path, header) or skeleton.contact_model)
     if header.get("baseline") is not None:

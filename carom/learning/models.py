@@ -22,12 +22,13 @@ class SegmentEnergy(eqx.Module):
 
         V = energy sum_k c_k q^k,   k = 1, ..., 4,   q = (length - mean) / spread.
 
-    A segment stretches by little of its length, so that the energy's curvature along it is a thousand times that along
-    other directions. A network of the points' coordinates learns such a curvature last, if at all.
+    The highest powers may be left out. A segment stretches by little of its length, so that the energy's curvature
+    along it is a thousand times that along other directions. A network of the points' coordinates learns such a
+    curvature last, if at all.
     """
 
     ends: tuple[tuple[int, int], ...] = eqx.field(static=True)  # points; -1: the anchor
-    coefficients: Float[Array, "s 4"]
+    coefficients: Float[Array, "s degree"]
     # Of the data and the geometry: not learned.
     anchors: Float[Array, "s 2"]  # m
     mean: Float[Array, " s"]  # m
@@ -67,7 +68,7 @@ class SegmentEnergy(eqx.Module):
     def __call__(self, x: Float[Array, "n 2"]) -> Float[Array, ""]:
         mean, spread, energy = (a.astype(x.dtype) for a in jax.lax.stop_gradient((self.mean, self.spread, self.energy)))
         q = (self.lengths(x) - mean) / spread
-        powers = jnp.stack([q, q**2, q**3, q**4], axis=1)
+        powers = jnp.stack([q, q**2, q**3, q**4][: self.coefficients.shape[1]], axis=1)
         return energy * jnp.sum(self.coefficients.astype(x.dtype) * powers)
 
 
@@ -76,14 +77,14 @@ class NeuralPotential(Potential):
 
     The linear term, `sum slope * x`, is a uniform field: what it explains, such as gravity, also holds where there were
     no data, which is not so of a network. Where chains may stretch, the elastic energy of their segments is added: see
-    `SegmentEnergy`.
+    `SegmentEnergy`. `network` is None where the data need none: what is not there costs no time.
 
     **Arguments:** `n_points`, `dim`: of the system; `width`, `depth`: units of a hidden layer, number of hidden layers;
     `key`: random key of the initial weights; `dtype`: of the network's weights and of its evaluation (single precision
     by default, also inside of simulations in double); `segments`: elastic energy of segments, or `None`.
     """
 
-    network: eqx.nn.MLP
+    network: eqx.nn.MLP | None
     slope: Float[Array, "n d"]  # N
     segments: SegmentEnergy | None
 
@@ -113,35 +114,53 @@ class NeuralPotential(Potential):
         return cls(skeleton.n_points, skeleton.dim, key=key, dtype=dtype, segments=segments, **sizes)
 
     def __call__(self, x, mass_matrix):
-        inputs = x.reshape(-1).astype(self.network.layers[0].weight.dtype)
-        value = self.network(inputs).astype(x.dtype) + jnp.sum(self.slope.astype(x.dtype) * x)
+        value = jnp.sum(self.slope.astype(x.dtype) * x)
+        if self.network is not None:
+            inputs = x.reshape(-1).astype(self.network.layers[0].weight.dtype)
+            value = self.network(inputs).astype(x.dtype) + value
         return value if self.segments is None else value + self.segments(x)
 
     def linear_weights(self) -> tuple[Any, ...]:
-        """The parameters in which the potential is linear: the output layer's weights first, then the linear term's and
-        those of the segments.
+        """The parameters in which the potential is linear: the output layer's weights, if there is a network, then the
+        linear term's and those of the segments.
 
         Arrays, or what `equinox.tree_at` puts in their place.
         """
-        weights = self.network.layers[-1].weight, self.slope
-        return weights if self.segments is None else (*weights, self.segments.coefficients)
-
-    def simpler(self) -> list[np.ndarray]:
-        """Which of all linear weights simpler potentials have, the simplest first (flags, flat).
-
-        A uniform field and linear springs; the same with the whole energy of segments; neither has the network.
-        """
-        output, *rest = self.linear_weights()
-        whole = np.repeat([False, True], [output.size, sum(w.size for w in rest)])
-        if self.segments is None:
-            return [whole]
-        linear = whole.copy()
-        linear[-self.segments.coefficients.size :] = np.tile([True, True, False, False], len(self.segments.ends))
-        return [linear, whole]
+        output = () if self.network is None else (self.network.layers[-1].weight,)
+        segments = () if self.segments is None else (self.segments.coefficients,)
+        return *output, self.slope, *segments
 
     def with_linear_weights(self, weights: tuple[Any, ...]) -> "NeuralPotential":
         """The potential with other values of `linear_weights`."""
         return eqx.tree_at(lambda p: p.linear_weights(), self, weights)
+
+    def simpler(self) -> list["NeuralPotential"]:
+        """Potentials with fewer parameters, the simplest first: without network, and with linear springs at first."""
+        if self.network is None:
+            return []
+        bare = eqx.tree_at(lambda p: p.network, self, None)
+        if self.segments is None:
+            return [bare]
+        linear = eqx.tree_at(lambda p: p.segments.coefficients, bare, self.segments.coefficients[:, :2])
+        return [linear, bare]
+
+    def extended(self, full: "NeuralPotential") -> "NeuralPotential":
+        """The same energy with all parameters that `full` has: its hidden layers, and zeros."""
+        out = self
+        if self.network is None and full.network is not None:
+            network = eqx.tree_at(lambda n: n.layers[-1].weight, full.network, replace_fn=jnp.zeros_like)
+            out = eqx.tree_at(lambda p: p.network, out, network, is_leaf=lambda part: part is None)
+        if self.segments is not None and full.segments is not None:
+            there = self.segments.coefficients
+            missing = full.segments.coefficients.shape[1] - there.shape[1]
+            padded = jnp.pad(there, ((0, 0), (0, missing)))
+            out = eqx.tree_at(lambda p: p.segments.coefficients, out, padded)
+        return out
+
+    def pruned(self) -> "NeuralPotential":
+        """The same forces, without a network that makes none."""
+        idle = self.network is not None and not np.any(np.asarray(self.network.layers[-1].weight))
+        return eqx.tree_at(lambda p: p.network, self, None) if idle else self
 
 
 class Unknowns(eqx.Module):

@@ -5,19 +5,21 @@ straight to where the gradient steps of a training, which take one after the oth
 """
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.learning.dataset import all_gaps
 from carom.learning.models import NeuralPotential, Unknowns
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.sensitivity import StepSensitivity, force_features, step_sensitivity
+from carom.mechanics.dynamics import saddle_point
 from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
 from carom.system import System
@@ -26,6 +28,8 @@ MOST_POINTS = 40
 """Largest system that is refined: derivatives of a step by the state before it grow with the cube of its size."""
 BATCH = 250
 """Steps that are looked at together."""
+MOST_CHANGE = 1.0
+"""By which a physical parameter moves in one step at most."""
 SMALLEST_ERROR = 1e-6
 """No standard error is taken to be smaller than this: the contact solver's own accuracy."""
 
@@ -113,23 +117,34 @@ class Problem:
     features: Float[np.ndarray, "W F"]
 
 
-def principal_forces(
-    unknowns: Unknowns, recording: Recording, steps, config: IdentifyConfig, weights: Bool[np.ndarray, " W"] | None
-):
-    """The principal directions (W, F) of the forces of a potential's linear weights; F = 0 without a potential.
+@eqx.filter_jit
+def _accelerations(potential: NeuralPotential, system: System, x: Float[Array, "S n d"]) -> Float[Array, "S nd W"]:
+    """What a unit of each linear weight of a potential adds to the accelerations (m/s^2), joints taken into account."""
+    inverse_mass = system.inverse_mass_matrix()
 
-    Of all of them, or of the `weights` that are flagged. At most `config.directions`, with a root mean square force of
-    at least `smallest_force` of the largest one's.
+    def at(x):
+        force = force_features(potential, x)
+        free = jnp.einsum("ij,jdw->wid", inverse_mass, force.reshape(*x.shape, -1))
+        if system.links:
+            free = saddle_point(system.constraints, x, inverse_mass).project(free)
+        return jnp.moveaxis(free, 0, -1).reshape(force.shape)
+
+    return jax.vmap(at)(x)
+
+
+def principal_directions(unknowns: Unknowns, system: System, recording: Recording, steps, config: IdentifyConfig):
+    """The principal directions (W, F) of a potential's linear weights, by what they do; F = 0 without a potential.
+
+    At most `config.directions`, with a root mean square acceleration of at least `smallest_force` of the largest one's:
+    forces that joints take up do nothing.
     """
     if unknowns.potential is None:
         return np.zeros((0, 0))
     x = jnp.asarray(recording.x[steps[:, 0], steps[:, 1]][:: max(1, len(steps) // 500)])
-    forces = np.array(eqx.filter_jit(eqx.filter_vmap(force_features, in_axes=(None, 0)))(unknowns.potential, x))
-    forces = forces.reshape(-1, forces.shape[-1])
-    if weights is not None:
-        forces[:, ~weights] = 0
-    values, vectors = np.linalg.eigh(forces.T @ forces)
-    return vectors[:, values > config.smallest_force**2 * values[-1]][:, -config.directions :]
+    done = np.array(_accelerations(unknowns.potential, unknowns.assemble(system), x))
+    done = done.reshape(-1, done.shape[-1])
+    _, sizes, directions = np.linalg.svd(done, full_matrices=False)
+    return directions[sizes > config.smallest_force * sizes[0]][: config.directions].T
 
 
 @eqx.filter_jit
@@ -157,23 +172,13 @@ def sensitivities(problem: Problem, unknowns: Unknowns) -> StepSensitivity:
 
 
 def new_problem(
-    unknowns: Unknowns,
-    system: System,
-    stepper: Stepper,
-    recording: Recording,
-    config: IdentifyConfig,
-    weights: Bool[np.ndarray, " W"] | None = None,
+    unknowns: Unknowns, system: System, stepper: Stepper, recording: Recording, config: IdentifyConfig
 ) -> Problem:
-    """Chooses the steps of `recording` to look at, none of which starts in contact, and the forces that may change.
-
-    `weights`: which linear weights of the potential take part, if not all; the others become 0.
-    """
+    """Chooses the steps of `recording` to look at, none of which starts in contact, and the forces that may change."""
     steps, most = choose_steps(recording, system, config)
     # Room for as many contacts as the steps close at once, and two more for what the ballistic guess misses.
     skeleton = system.with_max_active(most + 2) if system.contacts else system
-    if unknowns.potential is not None and weights is not None:
-        unknowns = _with_weights(unknowns, np.where(weights, 0, -_linear_weights(unknowns)))
-    features = principal_forces(unknowns, recording, steps, config, weights)
+    features = principal_directions(unknowns, skeleton, recording, steps, config)
     return Problem(unknowns, skeleton, stepper, recording, steps, features)
 
 
@@ -185,8 +190,8 @@ class Refined(NamedTuple):
     seen: StepSensitivity
 
 
-def refine(problem: Problem, config: IdentifyConfig) -> Refined:
-    """Gauss-Newton steps from `problem.unknowns` to the parameters that fit the steps best."""
+def refinements(problem: Problem, config: IdentifyConfig) -> Iterator[Refined]:
+    """One Gauss-Newton step after another, from `problem.unknowns` towards what fits the steps best; without end."""
     unknowns, count = problem.unknowns, len(_vector(problem.unknowns))
 
     directions = problem.features.shape[1]
@@ -199,18 +204,19 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
     weights, ridge = _linear_weights(unknowns), _ridge(unknowns)
     prior = np.eye(count + directions)
     prior[count:, count:] = problem.features.T @ (ridge[:, None] * problem.features)
-    most = whole(np.full(count, 0.5), np.inf)
+    most = whole(np.full(count, MOST_CHANGE), np.inf)
     lower, upper = (whole(end, rest) for end, rest in zip(_bounds(unknowns), (-np.inf, np.inf), strict=True))
     changed = np.zeros(len(prior))
     seen = sensitivities(problem, unknowns)
     errors = error_sizes(seen, problem.recording)
     kept = beyond_doubt(seen, errors, config.doubt)
-    k = 0
-    while True:
+    for k in itertools.count():
         kept = kept & _finite(seen)
         seen = _those(seen, kept)
         now = whole(_vector(unknowns), 0.0)
         pull = prior @ changed
+        if not config.redescend:
+            pull[:count] = 0  # what is blind here need not have been where the first step began
         pull[count:] += problem.features.T @ (ridge * weights)
         solution = solve(
             whitened(seen, problem, errors, kept),
@@ -222,19 +228,33 @@ def refine(problem: Problem, config: IdentifyConfig) -> Refined:
         )
         changed = changed + solution.change
         unknowns = _moved(problem, changed)
-        k += 1
-        if k == config.rounds or (k > 2 and _settled(solution, count)):
-            return Refined(unknowns, solution, seen)
+        yield Refined(unknowns, solution, seen)
         seen = sensitivities(problem, unknowns)
         if not config.redescend:
             errors = error_sizes(seen, problem.recording)
+            kept = beyond_doubt(seen, errors, config.doubt)
 
 
-POLISH = IdentifyConfig(impacts=1000, smooth_steps=1000, rounds=3, directions=400, smallest_force=1e-7, redescend=False)
-"""How a training refines, on the way and at its end.
+def refine(problem: Problem, config: IdentifyConfig) -> Refined:
+    """The parameters that fit the steps best: Gauss-Newton steps until these move by little of their errors."""
+    count = len(_vector(problem.unknowns))
+    for k, refined in enumerate(refinements(problem, config), 1):
+        if k == config.rounds or (k > 1 and _settled(refined.solution, count)):
+            return refined
+    raise AssertionError("there is always another step")
+
+
+POLISH = IdentifyConfig(
+    impacts=1000, smooth_steps=1000, rounds=14, directions=400, smallest_force=1e-7, redescend=False
+)
+"""How a training refines, before the first epoch, on the way and at its end.
 
 Steps that do not fit keep some weight: a model that is not there yet is not a wrong one.
 """
+PATIENCE = 3
+"""So many steps may pass until the loss is half of what it was; else the last step is made."""
+AT_BOUND = 0.02
+"""Frictions and restitutions so near to a bound, which data seldom tell apart from it, are tried there."""
 
 
 def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
@@ -249,19 +269,56 @@ def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
     return double and skeleton.n_points <= MOST_POINTS and not (networks or nothing)
 
 
+class Fit(NamedTuple):
+    """How well unknowns predict chunks: the mean error, and that of the better nine tenths of the chunks.
+
+    A few chunks in which rounding decides what is in contact say nothing about the unknowns.
+    """
+
+    mean: float
+    typical: float
+
+
 def polish(
     unknowns: Unknowns,
     skeleton: System,
     stepper: Stepper,
     recording: Recording,
-    weights: Bool[np.ndarray, " W"] | None = None,
-) -> Unknowns | None:
-    """Learned unknowns that `can_be_refined`, refined; None where no recorded step starts without contact.
+    judge: Callable[[Unknowns], Fit],
+    enough: float,
+) -> tuple[Unknowns, Fit]:
+    """Learned unknowns that `can_be_refined`, refined until their typical error is `enough`, or falls no more.
 
-    `weights`: which linear weights of the potential it has, if not all.
+    Also how well they fit: infinitely badly where no recorded step starts without contact.
     """
-    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, POLISH, weights)
-    return refine(_within(problem), POLISH).unknowns if len(problem.steps) else None
+    best, fit = unknowns, Fit(np.inf, np.inf)
+    problem = new_problem(unknowns, unknowns.assemble(skeleton), stepper, recording, POLISH)
+    if not len(problem.steps):
+        return best, fit
+    errors: list[float] = []
+    for refined in itertools.islice(refinements(_within(problem), POLISH), POLISH.rounds):
+        now = judge(refined.unknowns)
+        if now.mean < fit.mean:
+            best, fit = refined.unknowns, now
+        errors.append(now.typical)
+        slow = len(errors) > PATIENCE and not min(errors[-PATIENCE:]) < 0.5 * min(errors[:-PATIENCE])
+        if now.typical <= enough or slow:
+            break
+    there = _at_bounds(best)
+    now = judge(there)
+    return (there, now) if now.mean < fit.mean else (best, fit)
+
+
+def _at_bounds(unknowns: Unknowns) -> Unknowns:
+    """Frictions and restitutions moved onto a bound that is near."""
+    for name in ("friction", "restitution"):
+        lower, upper = PHYSICAL[name]
+        value = getattr(unknowns, name)
+        if value is not None:
+            value = jnp.select([value < lower + AT_BOUND, value > upper - AT_BOUND], [lower, upper], value)
+            value = jnp.asarray(value, getattr(unknowns, name).dtype)
+            unknowns = eqx.tree_at(lambda u, name=name: getattr(u, name), unknowns, value)
+    return unknowns
 
 
 def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivity:
@@ -287,10 +344,10 @@ def _ridge(unknowns: Unknowns) -> Float[np.ndarray, " W"]:
     """Precision of the weights that are profiled out: those of the network are of the size that they begin with."""
     if unknowns.potential is None:
         return np.zeros(0)
-    weights = unknowns.potential.linear_weights()
-    output = weights[0].size
-    share = np.where(np.arange(sum(w.size for w in weights)) < output, 1.0, _FREE)
-    return 3 * output * share  # uniform within +-1 / sqrt(output)
+    sizes = [w.size for w in unknowns.potential.linear_weights()]
+    output = 0 if unknowns.potential.network is None else sizes[0]
+    share = np.where(np.arange(sum(sizes)) < output, 1.0, _FREE)
+    return 3 * max(output, 1) * share  # uniform within +-1 / sqrt(output)
 
 
 def _within(problem: Problem) -> Problem:

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,14 +47,42 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
     """Of the step from the recorded state `start` to `end`, each `(x, v)`.
 
     The Jacobian has a column for the properties of the closed contacts only, so that its cost does not grow with the
-    number of properties. To first order in the time step: forces of the weights are those at the start, held over it.
+    number of properties. Derivatives by state and weights are those of a step of the midpoint rule, which costs half of
+    RK4's. Of a network's many weights, which are known by their forces, they are to first order in the time step: the
+    forces are those at the start, held over it.
     """
     x, v = start
     system = unknowns.assemble(skeleton)
     free = dataclasses.replace(stepper, contact=False)
-    before = step(system, x, v, free)
+    masses = jnp.zeros(0 if unknowns.log_mass_ratio is None else unknowns.log_mass_ratio.shape, x.dtype)
+
+    def flow(nudge):
+        out = step(_nudged(unknowns, nudge, skeleton), x, v, free)
+        return (out.x, out.v), (out.x, out.v)
+
+    potential = unknowns.potential
+    by_force = potential is not None and potential.network is not None
+
+    def coarse(nudge):
+        coarser = dataclasses.replace(free, solver=diffrax.Midpoint())
+        moved, force = system, nudge["weights"] if by_force else None
+        if not by_force and potential is not None:
+            weights = (
+                w + change.astype(w.dtype)
+                for w, change in zip(potential.linear_weights(), nudge["weights"], strict=True)
+            )
+            moved = eqx.tree_at(lambda s: s.potential, system, potential.with_linear_weights(tuple(weights)))
+        out = step(moved, x + nudge["x"], v + nudge["v"], coarser, force)
+        return out.x, out.v
+
+    if by_force:
+        nothing = jnp.zeros_like(x)
+    else:
+        nothing = () if potential is None else tuple(jnp.zeros_like(w, x.dtype) for w in potential.linear_weights())
+    by_mass, (x1, v1) = jax.jacfwd(flow, has_aux=True)({"mass": masses})
+    by_state = jax.jacfwd(coarse)({"x": jnp.zeros_like(x), "v": jnp.zeros_like(x), "weights": nothing})
     if skeleton.contacts:
-        active = system.active(before.x)
+        active = system.active(x1)
         place = jnp.where(active.active, active.property_index, skeleton.n_properties)
         # A property of two closed contacts gets one column, else its derivative would be counted twice.
         twice = jnp.any(jnp.tril(place[:, None] == place[None, :], -1), axis=1)
@@ -61,35 +90,47 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
     else:
         place = column = jnp.zeros(0, int)
 
-    def predict(nudge):
-        moved = _nudged(unknowns, nudge, column, skeleton)
-        out = step(moved, x + nudge["x"], v + nudge["v"], free, nudge["force"])
-        x1, v1 = out.x, out.v
+    def touch(nudge):
         if not skeleton.contacts:
-            return (x1, v1), (x1, v1, Jump(jnp.zeros_like(v1), jnp.zeros((), x.dtype)))
-        _, jump = contact_jump(moved, x1, v1, moved.inverse_mass_matrix(), stepper)
-        return (x1, v1 + jump.velocity), (x1, v1 + jump.velocity, jump)
+            return v1 + nudge["v"], Jump(jnp.zeros_like(v1), jnp.zeros((), x.dtype))
+        moved = _nudged(unknowns, nudge, skeleton, column)
+        after = v1 + nudge["v"]
+        _, jump = contact_jump(moved, x1 + nudge["x"], after, moved.inverse_mass_matrix(), stepper)
+        return after + jump.velocity, jump
 
     zeros = jnp.zeros(column.shape, x.dtype)
-    masses = jnp.zeros(0 if unknowns.log_mass_ratio is None else unknowns.log_mass_ratio.shape, x.dtype)
-    nothing = {"mass": masses, "friction": zeros, "restitution": zeros}
-    nothing |= {name: jnp.zeros_like(x) for name in ("x", "v", "force")}
-    jacobian, (x1, v1, jump) = jax.jacfwd(predict, has_aux=True)(nothing)
+    nothing = {"mass": masses, "friction": zeros, "restitution": zeros, "x": jnp.zeros_like(x), "v": jnp.zeros_like(x)}
+    by_jump, jump = jax.jacfwd(touch, has_aux=True)(nothing)
     impulse = jnp.zeros((0, len(column), x.shape[1]), x.dtype) if jump.impulse is None else jump.impulse
+    by_jump = {name: part.reshape(x.size, -1) for name, part in by_jump.items()}
+    v1 = v1 + jump.velocity
 
-    def rows(name):
-        return jnp.concatenate([part[name].reshape(x.size, -1) for part in jacobian])
+    def rows(first):
+        """Derivatives after the contacts of those before them."""
+        position, velocity = (part.reshape(x.size, -1) for part in first)
+        return jnp.concatenate([position, by_jump["x"] @ position + by_jump["v"] @ velocity])
+
+    def contact_rows(name):
+        return jnp.concatenate([jnp.zeros_like(by_jump[name]), by_jump[name]])
+
+    def weight_rows():
+        if by_force:
+            return rows([part["weights"] for part in by_state]) @ force_features(potential, x)
+        if potential is None:
+            return jnp.zeros((2 * x.size, 0), x.dtype)
+        flat = ([w.reshape(x.size, -1) for w in part["weights"]] for part in by_state)
+        return rows([jnp.concatenate(part, axis=1) for part in flat])
 
     return StepSensitivity(
         residual=jnp.concatenate([(x1 - end[0]).reshape(-1), (v1 - end[1]).reshape(-1)]),
-        log_mass_ratio=rows("mass"),
-        friction=rows("friction"),
-        restitution=rows("restitution"),
-        state=jnp.concatenate([rows("x"), rows("v")], axis=1),
-        weights=rows("force") @ force_features(unknowns.potential, x),
+        log_mass_ratio=rows([part["mass"] for part in by_mass]) + contact_rows("mass"),
+        friction=contact_rows("friction"),
+        restitution=contact_rows("restitution"),
+        state=jnp.concatenate([rows([part[name] for part in by_state]) for name in ("x", "v")], axis=1),
+        weights=weight_rows(),
         column=column,
         gap_before=system.gaps(x),
-        gap=system.gaps(before.x),
+        gap=system.gaps(x1),
         gap_slope=jax.jacfwd(system.gaps)(x).reshape(-1, x.size),
         property=place,
         jump=jnp.linalg.norm(jump.velocity),
@@ -98,11 +139,13 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
     )
 
 
-def _nudged(unknowns: Unknowns, nudge, column, skeleton: System) -> System:
-    """The system with its masses, and friction and restitution of the properties `column`, changed a little."""
+def _nudged(unknowns: Unknowns, nudge, skeleton: System, column: Int[Array, " K"] | None = None) -> System:
+    """The system with its masses changed a little, and friction and restitution of the properties `column`."""
     if unknowns.log_mass_ratio is not None:
         unknowns = eqx.tree_at(lambda u: u.log_mass_ratio, unknowns, unknowns.log_mass_ratio + nudge["mass"])
     system = unknowns.assemble(skeleton)
+    if column is None:
+        return system
     friction, restitution = (
         getattr(system, name).at[column].add(nudge[name], mode="drop") for name in ("friction", "restitution")
     )

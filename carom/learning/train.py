@@ -1,6 +1,7 @@
 """The trainer: one for every system and model. `learn` fits the unknowns of a skeleton to a dataset."""
 
 import dataclasses
+import itertools
 import time
 import warnings
 from typing import Any
@@ -20,7 +21,7 @@ from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_fla
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule, make_optimizer
 from carom.learning.progress import LoopProgress, training_text
-from carom.learning.refine import can_be_refined, polish
+from carom.learning.refine import Fit, can_be_refined, polish
 from carom.learning.run import RunFolder
 from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
@@ -35,7 +36,8 @@ class LearnReport:
     friction: list[float]
     restitution: list[float]
     mass_ratio: list[float]
-    train_loss: float
+    train_loss: float | None
+    """None where no epoch was needed: the refinement before the first was enough."""
     val_loss: float
     epochs: int
     seconds: float
@@ -76,11 +78,10 @@ def initial_unknowns(skeleton: System, config: LearnConfig, recording: Recording
     def chosen(name, value):
         return value if name in config.learn and ("mass" if name == "potential" else name) in has else None
 
+    key = jax.random.key(config.seed)
+    potential = NeuralPotential.of(skeleton, recording, key=key, width=config.width, depth=config.depth)
     if isinstance(skeleton.potential, NeuralPotential):
-        potential = skeleton.potential
-    else:
-        key = jax.random.key(config.seed)
-        potential = NeuralPotential.of(skeleton, recording, key=key, width=config.width, depth=config.depth)
+        potential = skeleton.potential.extended(potential)
     return Unknowns(
         log_mass_ratio=chosen("mass", jnp.zeros(len(skeleton.bodies) - 1, floats)),
         friction=chosen("friction", jnp.full(count, config.initial_friction, floats)),
@@ -108,12 +109,12 @@ def initial_baseline(skeleton: System, config: LearnConfig) -> ContactModel | St
 
 
 REFINE_AFTER = 0.4
-"""Share of the epochs after which the unknowns are refined for the first time; the second time is at the end.
+"""Share of the epochs after which the unknowns are refined, potential included; again at the end.
 
-If that is not enough, the network goes on learning with the right masses, which it cannot tell from its own errors.
+If that is not enough, the network goes on learning with better masses, which it cannot tell from its own errors.
 """
 EXACT = 0.01
-"""A refinement that came to this share of what is enough is not refined again."""
+"""A refinement ends that came to this share of what is enough."""
 LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
 
@@ -188,9 +189,13 @@ def train_step(data, unknowns, opt_state, rates: Rates, stepper, length, width):
 
 @eqx.filter_jit
 def validate(unknowns, skeleton, x, v, stepper):
-    """Mean absolute error of positions plus that of velocities, for chunks that are not trained on."""
+    """Mean absolute error of positions plus that of velocities, for chunks that are not trained on.
+
+    And the same for the better nine tenths of the chunks.
+    """
     error_x, error_v, _ = chunk_errors(unknowns, skeleton, stepper, x, v)
-    return jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v))
+    chunk = jnp.mean(jnp.abs(error_x) + jnp.abs(error_v), axis=(1, 2, 3))
+    return jnp.mean(chunk), jnp.mean(jnp.sort(chunk)[: max(1, chunk.size * 9 // 10)])
 
 
 def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> TrainState:
@@ -270,7 +275,8 @@ def learn(
     - `progress`: show it.
 
     **Returns:** the learned system (of the best validation loss), and a report. Unless `config.refine` is off, steps of
-    Gauss and Newton refine it on the way and at the end (see `carom.learning.refine`), if that validates better.
+    Gauss and Newton refine it on the way and at the end (see `carom.learning.refine`), if that validates better. Its
+    potential has no network if the data need none.
 
     **Raises:** `CaromError` if data, skeleton and configuration do not fit, or the loss stays not finite.
     """
@@ -296,6 +302,8 @@ def learn(
     if run is not None and restored is not None:
         state = restored
         run.rewind_metrics(int(state.epoch))
+    elif run is not None and run.metrics():  # killed before its first checkpoint
+        run.rewind_metrics(-1)
     stepper = Stepper(
         dt=jnp.asarray(train.dt),
         formulation=FORMULATIONS[config.model],
@@ -312,60 +320,92 @@ def learn(
 
     rate = learning_rate_schedule(config, config.epochs * steps)
     held_out = _validation_chunks(val, skeleton, config)
-    last = run.metrics()[-1] if run is not None and restored is not None else {"seconds": 0.0, "loss": np.nan}
+    last = run.metrics()[-1] if run is not None and restored is not None else {"seconds": 0.0}
     started = time.monotonic() - last["seconds"]
-    loss = jnp.asarray(last["loss"])
+    loss = jnp.asarray(last.get("loss", np.nan))
     stopped = False
     refines = config.refine and can_be_refined(state.unknowns, trained)
     refine_at = round(REFINE_AFTER * config.epochs)
+    enough = config.enough * speed
+
+    def judge(unknowns: Unknowns) -> Fit:
+        return Fit(*map(float, validate(unknowns, trained, *held_out, stepper)))
+
+    def log(epoch: int, unknowns: Unknowns, **numbers: Any) -> dict[str, Any]:
+        metrics = {
+            "epoch": epoch,
+            "step": epoch * steps,
+            "seconds": round(time.monotonic() - started, 3),
+            **numbers,
+            **quantities(unknowns.assemble(skeleton)),
+            "skipped_steps": int(state.skipped),
+            "overflowed_contacts": int(state.overflow),
+        }
+        if run is not None:
+            run.log(metrics)
+        return metrics
 
     def just_refined(state: TrainState) -> bool:
-        return bool(state.settled) and int(state.best_epoch) == refine_at
+        return bool(state.settled) and int(state.best_epoch) in (0, refine_at)
 
-    def refined(unknowns: Unknowns, val_loss: float) -> tuple[Unknowns, float] | None:
-        """Unknowns that validate better than these, and how well they do: the simplest potential that is enough."""
+    def refined(unknowns: Unknowns, fit: Fit, *, whole: bool) -> tuple[Unknowns, Fit] | None:
+        """Unknowns that validate better than these, and how well: of the simplest potential that is enough.
+
+        `whole`: try the whole potential too. If not, this is the first time: each step is logged.
+        """
         shown.say("refining ...")
-        best = None
-        for weights in (*([] if unknowns.potential is None else unknowns.potential.simpler()), None):
-            new = polish(unknowns, trained, stepper, train, weights)
-            new_loss = np.inf if new is None else float(validate(new, trained, *held_out, stepper))
-            if new is not None and new_loss < val_loss:
-                best, val_loss = (new, new_loss), new_loss
-            if new_loss <= config.enough * speed:
+        best, full, count = None, unknowns.potential, itertools.count(1)
+
+        def extended(new: Unknowns) -> Unknowns:
+            if full is None or new.potential is None:
+                return new
+            return dataclasses.replace(new, potential=new.potential.extended(full))
+
+        def judge_step(new: Unknowns) -> Fit:
+            found = judge(extended(new))
+            if not whole:
+                log(0, new, refinement=next(count), val_loss=found.mean)
+            return found
+
+        for potential in ([] if full is None else full.simpler()) + ([full] if whole or full is None else []):
+            start = dataclasses.replace(unknowns, potential=potential)
+            new, found = polish(start, trained, stepper, train, judge_step, EXACT * enough)
+            if found.mean < fit.mean:
+                best, fit = (extended(new), found), found
+            if found.typical <= enough:
                 break
         return best
 
+    def settle(state: TrainState, better: tuple[Unknowns, Fit]) -> TrainState:
+        """Go on from what was refined."""
+        optimizer = fresh_optimizer(better[0], config)
+        return dataclasses.replace(state, unknowns=better[0], optimizer=optimizer, settled=jnp.asarray(True))
+
     with LoopProgress("epoch", config.epochs, int(state.epoch), shown=progress) as shown:
+        if refines and restored is None:
+            better = refined(state.unknowns, judge(state.unknowns), whole=False)
+            if better is not None:
+                state = _keep_best(settle(state, better), better[1].mean, 0)
+                if run is not None:
+                    run.save_checkpoint(0, state)
+        fit = judge(state.best)
         for epoch in range(int(state.epoch) + 1, config.epochs + 1):
-            if just_refined(state) and float(state.best_loss) <= config.enough * speed:
+            if just_refined(state) and fit.typical <= enough:
                 stopped = True
                 break
             state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
-            val_loss = validate(state.unknowns, trained, *held_out, stepper)
+            now = judge(state.unknowns)
             if refines and epoch == refine_at:
-                better = refined(state.unknowns, float(val_loss))
+                better = refined(state.unknowns, now, whole=True)
                 if better is not None:
-                    unknowns, val_loss = better
-                    optimizer = fresh_optimizer(unknowns, config)
-                    state = dataclasses.replace(
-                        state, unknowns=unknowns, optimizer=optimizer, settled=jnp.asarray(True)
-                    )
-            state = _keep_best(state, val_loss, epoch)
-            metrics = {
-                "epoch": epoch,
-                "step": epoch * steps,
-                "seconds": round(time.monotonic() - started, 3),
-                "loss": float(loss),
-                "val_loss": float(val_loss),
-                "learning_rate": float(np.asarray(rate(epoch * steps))),
-                **quantities(state.unknowns.assemble(skeleton)),
-                "skipped_steps": int(state.skipped),
-                "overflowed_contacts": int(state.overflow),
-            }
-            if run is not None:
-                run.log(metrics)
-                if epoch % config.checkpoint_every == 0 or epoch in (refine_at, config.epochs):
-                    run.save_checkpoint(epoch, state)
+                    now, state = better[1], settle(state, better)
+            if now.mean < float(state.best_loss):
+                fit = now
+            state = _keep_best(state, now.mean, epoch)
+            learning_rate = float(np.asarray(rate(epoch * steps)))
+            metrics = log(epoch, state.unknowns, loss=float(loss), val_loss=now.mean, learning_rate=learning_rate)
+            if run is not None and (epoch % config.checkpoint_every == 0 or epoch in (refine_at, config.epochs)):
+                run.save_checkpoint(epoch, state)
             shown.update(epoch, training_text(metrics))
             require(
                 bool(jnp.isfinite(loss)) or epoch < 3 or not np.isinf(float(state.best_loss)),
@@ -375,15 +415,17 @@ def learn(
             if epoch - int(state.best_epoch) >= config.patience:
                 stopped = True
                 break
-        best, val_loss = state.best, float(state.best_loss)
-        exact = just_refined(state) and val_loss <= EXACT * config.enough * speed
-        better = refined(best, val_loss) if refines and not exact else None
-        best, val_loss = (best, val_loss) if better is None else better
+        best = state.best
+        again = not (just_refined(state) and int(state.epoch) == int(state.best_epoch))
+        better = refined(best, fit, whole=True) if refines and again else None
+        best, fit = (best, fit) if better is None else better
+    if best.potential is not None:
+        best = dataclasses.replace(best, potential=best.potential.pruned())
     system = best.assemble(skeleton)
     report = LearnReport(
         **quantities(system),
-        train_loss=float(loss),
-        val_loss=val_loss,
+        train_loss=float(loss) if int(state.epoch) else None,
+        val_loss=fit.mean,
         epochs=int(state.epoch),
         seconds=time.monotonic() - started,
         stopped_early=stopped,

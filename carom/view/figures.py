@@ -48,18 +48,24 @@ LARGEST_ERROR = 1e3
 def learning_curves(metrics: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
     """Training and validation loss and learning rate over epochs; returns the PNG's path.
 
+    Over Gauss-Newton steps, where a training ended with the refinement before its first epoch.
+
     **Arguments:** `metrics`, one mapping an epoch with `epoch`, `loss`, `val_loss`,
     `learning_rate`, each of which may be missing, None or NaN. Where an epoch was logged twice,
-    after a resume, the later entry counts.
+    after a resume, the later entry counts. Steps before the first epoch have `refinement`, their number.
 
     **Raises:** `CaromError` for values that are not numbers, or a path that cannot be written.
     """
-    epochs, rows = _by_epoch(metrics)
+    epochs, rows, unit = _by_epoch(metrics)
     loss, validation = _series(rows, "loss"), _series(rows, "val_loss")
     rate = _series(rows, "learning_rate")
     with figure_style():
         figure = new_figure(6.4, 4.2)
-        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
+        bottom = None
+        if unit == "epoch":
+            top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[4, 1])
+        else:
+            top = figure.subplots()
         drawn = _log_line(top, epochs, loss, color=BLUE, label="training")
         drawn |= _log_line(top, epochs, validation, color=VERMILLION, label="validation")
         lost = np.array([row.get("loss", 0.0) for row in rows], dtype=object)
@@ -74,20 +80,21 @@ def learning_curves(metrics: Sequence[Mapping[str, Any]], path: str | os.PathLik
                 markersize=4,
                 label="loss not finite",
             )
-        _mark_best(top, epochs, validation)
+        _mark_best(top, epochs, validation, unit)
         top.set_ylabel("loss")
         if drawn or broken.size:
             top.legend(loc="upper right", ncols=2)
         if not drawn:
             _empty(top, "no loss was recorded")
-        if _line(bottom, epochs, rate, np.isfinite(rate), color=MUTED, linewidth=1.2):
-            bottom.set_ylim(bottom=0)
-            bottom.yaxis.set_major_locator(MaxNLocator(nbins=2, min_n_ticks=2))
-            bottom.ticklabel_format(axis="y", scilimits=(-2, 2), useMathText=True)
-        else:
-            _empty(bottom, "no learning rate was recorded")
-        bottom.set_ylabel("learning\nrate")
-        _epoch_axis(bottom, epochs)
+        if bottom is not None:
+            if _line(bottom, epochs, rate, np.isfinite(rate), color=MUTED, linewidth=1.2):
+                bottom.set_ylim(bottom=0)
+                bottom.yaxis.set_major_locator(MaxNLocator(nbins=2, min_n_ticks=2))
+                bottom.ticklabel_format(axis="y", scilimits=(-2, 2), useMathText=True)
+            else:
+                _empty(bottom, "no learning rate was recorded")
+            bottom.set_ylabel("learning\nrate")
+        _epoch_axis(top if bottom is None else bottom, epochs, unit)
         figure.align_ylabels()
         return save_png(figure, path)
 
@@ -122,7 +129,7 @@ def contact_properties(
     **Raises:** `CaromError` for values that are not numbers, a truth of another length than what
     was learned, or a path that cannot be written.
     """
-    epochs, rows = _by_epoch(metrics)
+    epochs, rows, unit = _by_epoch(metrics)
     quantities = [
         quantity
         for quantity in (
@@ -142,7 +149,7 @@ def contact_properties(
                 _error_panel(axes[1], epochs, quantity)
             _name_lines(axes[-1], quantity)
         for axes in grid[-1]:
-            _epoch_axis(axes, epochs)
+            _epoch_axis(axes, epochs, unit)
         figure.align_ylabels(grid[:, 0])
         if truth is not None:
             handles = [
@@ -250,11 +257,17 @@ def _number(key: str, value: Any) -> float:
         raise CaromError(f"metrics: {key!r} must be a number or None; one was {value!r}.") from None
 
 
-def _by_epoch(metrics) -> tuple[np.ndarray, list[Mapping[str, Any]]]:
-    """Epochs in order with their entries, the last one of each."""
-    rows = {_number("epoch", row.get("epoch", k)): row for k, row in enumerate(metrics)}
+def _by_epoch(metrics) -> tuple[np.ndarray, list[Mapping[str, Any]], str]:
+    """Epochs in order with their entries, the last one of each, and what they are.
+
+    Steps before the first epoch, where there is no other.
+    """
+    unit, key = "epoch", "epoch"
+    if metrics and all("refinement" in row for row in metrics):
+        unit, key = "Gauss-Newton step", "refinement"
+    rows = {_number(key, row.get(key, k)): row for k, row in enumerate(metrics)}
     epochs = sorted(epoch for epoch in rows if np.isfinite(epoch))
-    return np.array(epochs, dtype=float), [rows[epoch] for epoch in epochs]
+    return np.array(epochs, dtype=float), [rows[epoch] for epoch in epochs], unit
 
 
 def _series(rows, key: str) -> np.ndarray:
@@ -352,8 +365,8 @@ def _log_line(axes: Axes, x: np.ndarray, y: np.ndarray, **style) -> bool:
     return drawn
 
 
-def _epoch_axis(axes: Axes, epochs: np.ndarray) -> None:
-    axes.set_xlabel("epoch")
+def _epoch_axis(axes: Axes, epochs: np.ndarray, unit: str) -> None:
+    axes.set_xlabel(unit)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=7))
     if epochs.size == 1:
         axes.set_xlim(epochs[0] - 1, epochs[0] + 1)
@@ -364,7 +377,7 @@ def _empty(axes: Axes, text: str) -> None:
     axes.set_yticks([])
 
 
-def _mark_best(axes: Axes, epochs: np.ndarray, validation: np.ndarray) -> None:
+def _mark_best(axes: Axes, epochs: np.ndarray, validation: np.ndarray, unit: str) -> None:
     good = np.isfinite(validation) & (validation > 0)
     if not good.any():
         return
@@ -378,7 +391,7 @@ def _mark_best(axes: Axes, epochs: np.ndarray, validation: np.ndarray) -> None:
         markeredgecolor="white",
         markeredgewidth=1.2,
         zorder=4,
-        label=f"best: {power(float(validation[best]))}, epoch {epochs[best]:.0f}",
+        label=f"best: {power(float(validation[best]))}, {unit} {epochs[best]:.0f}",
     )
 
 
