@@ -1,16 +1,22 @@
 """`carom evaluate RUN`: measure a learned model on test data."""
 
 import dataclasses
+from typing import Literal
 
+import numpy as np
 from rich.console import Console
 
-from carom.cli.arguments import FilePath, RunPath
+from carom.checks import require
+from carom.cli.arguments import FilePath, FolderPath, RunPath
 from carom.cli.learn import TEST_DATA, pictures, what_is_told
 from carom.cli.tables import evaluation_table, property_table, told_table
+from carom.cli.tosses import measure, nominal_width, other_run
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.protocols import box_of
 from carom.learning.run import CONFIG, MODEL, RunFolder
 from carom.simulation.files import load_recording
+from carom.system import System
 from carom.tasks import task
 
 
@@ -27,6 +33,10 @@ class Evaluate:
     """Run folder that `carom learn` has made."""
     data: FilePath = None
     """Trajectory file to test on; by default the run's own test data."""
+    protocol: Literal["A", "B"] = "A"
+    """For recorded tosses: A predicts from the first sample, B from the last before a corner can touch."""
+    against: FolderPath = None
+    """For recorded tosses: another run, to compare with toss by toss."""
 
     def after_interrupt(self) -> str:
         """What to say when interrupted."""
@@ -38,6 +48,10 @@ class Evaluate:
         config = run.read_json(CONFIG)
         name = config["task"]
         truth = task(name)
+        if config.get("tosses") is not None:
+            self._evaluate_tosses(run, truth)
+            return
+        require(self.against is None, "against compares runs that learned from recorded tosses; this one did not.")
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, truth)
         test = load_recording(self.data or run.path / TEST_DATA, task=name)
@@ -57,4 +71,13 @@ class Evaluate:
         if found is not None:
             console.print(told_table(system, found))
         console.print(evaluation_table(measures))
+        console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)
+
+    def _evaluate_tosses(self, run: RunFolder, skeleton: System) -> None:
+        console, system = Console(), load_model_into(run.path / MODEL, skeleton)
+        test = load_recording(self.data or run.path / TEST_DATA, task=skeleton.name)
+        width = nominal_width(skeleton, 2 * float(np.min(box_of(skeleton).half_widths)))
+        other = None if self.against is None else other_run(self.against, skeleton)
+        measures = measure(console, run, system, test, self.protocol, width, other)
+        run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

@@ -12,6 +12,7 @@ import carom
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, TaskName
 from carom.cli.tables import evaluation_table, property_table, told_table
+from carom.cli.tosses import learn_and_measure
 from carom.contact.impulses import contact_model_of
 from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS, LearnConfig
@@ -20,6 +21,7 @@ from carom.learning.evaluate import evaluate, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.model_file import save_model
 from carom.learning.run import MODEL, REPORT, TRUTH, RunFolder
+from carom.learning.tosses import TossConfig, can_learn_tosses
 from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
 from carom.simulation.rollout import Trajectory
@@ -57,6 +59,7 @@ class Learn:
     quick: bool = False
     """A small training of one minute or so after compilation, to try things out: few trajectories and epochs."""
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
+    tosses: TossConfig = dataclasses.field(default_factory=TossConfig)
 
     def after_interrupt(self) -> str:
         """What to say when interrupted."""
@@ -80,6 +83,9 @@ class Learn:
         self.config.prepare(truth)
         contact_model_of(self.data_contact_model, argument="data_contact_model")
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
+        if self.data is not None and can_learn_tosses(truth):
+            self._run_tosses(console, truth)
+            return
         folder = RunFolder.choose(self.out, f"{self.task}-{self.config.model}", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
@@ -102,6 +108,32 @@ class Learn:
         finally:
             run.close()
         self._finish(console, run, system, report, truth, dataset, test)
+
+    def _run_tosses(self, console: Console, skeleton: System) -> None:
+        """Recordings of a tossed body are noisy poses: they have a fit of their own."""
+        self.tosses.check()
+        folder = RunFolder.choose(self.out, f"{self.task}-tosses", resume=self.resume)
+        if not self.resume:
+            RunFolder.check_new(folder)
+        data = load_recording(self.data or "", task=self.task)
+        if self.val is None:
+            parts = Dataset.split(data, seed=self.config.seed)
+            data, val = parts.train, parts.val
+        else:
+            val = load_recording(self.val, task=self.task)
+        settings = {**self._description(), "tosses": dataclasses.asdict(self.tosses)}
+        if self.resume:
+            run = RunFolder.open(folder)
+            run.check_same(settings)
+        else:
+            run = RunFolder.create(folder, settings)
+            save_recording(run.path / TEST_DATA, val)
+        console.print(
+            f"Learning {self.task} from {data.n_trajectories} recorded tosses into {run.path}",
+            soft_wrap=True,
+            highlight=False,
+        )
+        learn_and_measure(console, run, skeleton, data, val, self.tosses)
 
     def _description(self) -> dict[str, Any]:
         return {

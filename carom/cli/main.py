@@ -14,6 +14,7 @@ import tyro
 from carom.cli.cache import use_compilation_cache
 from carom.cli.control import ControlCommand
 from carom.cli.evaluate import Evaluate
+from carom.cli.import_data import Import
 from carom.cli.learn import Learn
 from carom.cli.simulate import Simulate
 from carom.errors import CaromError
@@ -23,6 +24,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[ControlCommand, tyro.conf.subcommand("control")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
 )
 
 

@@ -84,6 +84,38 @@ class CMr(ContactModel):
         return _two_phase_jump(state, smoothing, jnp.where(present, self.epsilon.astype(state.delassus.dtype), 0))
 
 
+class SpeedCM(ContactModel):
+    """CM with a restitution that depends on the speed of approach, and a friction that depends on that of sliding:
+
+        e(v_n) = e exp(-restitution_decay |v_n|),   mu(v_t) = mu exp(-friction_decay |v_t|)
+
+    with the contact's velocities (m/s) before the impact; e is kept to at most 1. Real bodies bounce less from faster
+    impacts (W. Goldsmith, *Impact*, 1960), which is a positive `restitution_decay`. Both zero: CM.
+
+    **Arguments:** `restitution_decay`, `friction_decay` in s/m. They are leaves of the pytree and can be learned.
+
+    **Raises:** `CaromError` for values that are not one number.
+    """
+
+    restitution_decay: Float[Array, ""]
+    friction_decay: Float[Array, ""]
+
+    def __init__(self, restitution_decay: ArrayLike = 0.0, friction_decay: ArrayLike = 0.0):
+        self.restitution_decay, self.friction_decay = as_floats(restitution_decay), as_floats(friction_decay)
+        for name in ("restitution_decay", "friction_decay"):
+            shape = getattr(self, name).shape
+            require(shape == (), f"{name} must be one number; its shape was {shape}.")
+
+    def __call__(self, state, *, smoothing=0.0):
+        approach = jnp.maximum(-state.velocity[:, 0], 0)
+        square = jnp.sum(state.velocity[:, 1:] ** 2, axis=1)
+        sliding = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)  # its derivative at rest is 0
+        restitution = jnp.minimum(state.restitution * jnp.exp(-self.restitution_decay * approach), 1)
+        friction = state.friction * jnp.exp(-self.friction_decay * sliding)
+        changed = eqx.tree_at(lambda s: (s.restitution, s.friction), state, (restitution, friction))
+        return _two_phase_jump(changed, smoothing)
+
+
 class LCP(ContactModel):
     """Friction pyramids and Newton's restitution as one linear complementarity problem (appendix J).
 
@@ -115,7 +147,7 @@ class LCP(ContactModel):
         return Jump(_velocity_jump(state, solution.impulse), solution.residual, solution.impulse[None])
 
 
-CONTACT_MODELS: dict[str, type[ContactModel]] = {"cm": CM, "cmr": CMr, "lcp": LCP}
+CONTACT_MODELS: dict[str, type[ContactModel]] = {"cm": CM, "cmr": CMr, "lcp": LCP, "speed": SpeedCM}
 """Contact models by the names under which they are chosen and saved."""
 
 

@@ -81,13 +81,19 @@ class Dataset(eqx.Module):
 
     @classmethod
     def split(cls, recording: Recording, *, val: float = 0.1, seed: int = 0) -> "Dataset":
-        """Divide the trajectories of one recording: a share `val` of them, at least one, for validation."""
+        """Divide the trajectories of one recording: a share `val` of them, at least one, for validation.
+
+        Where they are of several sessions (`group`), each session stays whole, and `val` is a share of the sessions.
+        """
         n = recording.n_trajectories
         require(n >= 2, f"a recording must have at least 2 trajectories to be split; it had {n}.")
         require(0 < val < 1, f"val must be a share between 0 and 1; it was {val}.")
-        order = np.random.default_rng(seed).permutation(n)
-        count = min(max(1, round(val * n)), n - 1)
-        return cls(recording.select(np.sort(order[count:])), recording.select(np.sort(order[:count])))
+        each = np.arange(n) if recording.group is None else recording.group
+        sessions = np.unique(each)
+        require(len(sessions) >= 2, "a recording of one session cannot be split: give a file to validate on.")
+        order = np.random.default_rng(seed).permutation(sessions)
+        held = np.isin(each, order[: min(max(1, round(val * len(sessions))), len(sessions) - 1)])
+        return cls(recording.select(~held), recording.select(held))
 
 
 def contact_flags(recording: Recording, system: System) -> Bool[np.ndarray, "N T"]:

@@ -253,6 +253,8 @@ Steps that do not fit keep some weight: a model that is not there yet is not a w
 """
 PATIENCE = 3
 """So many steps may pass until the loss is half of what it was; else the last step is made."""
+STILL = 1e-4
+"""A step that moves physical parameters by less is the last one: rare contacts hardly show in the typical error."""
 AT_BOUND = 0.02
 """Frictions and restitutions so near to a bound, which data seldom tell apart from it, are tried there."""
 
@@ -296,13 +298,15 @@ def polish(
     if not len(problem.steps):
         return best, fit
     errors: list[float] = []
+    count = len(_vector(unknowns))
     for refined in itertools.islice(refinements(_within(problem), POLISH), POLISH.rounds):
         now = judge(refined.unknowns)
         if now.mean < fit.mean:
             best, fit = refined.unknowns, now
         errors.append(now.typical)
         slow = len(errors) > PATIENCE and not min(errors[-PATIENCE:]) < 0.5 * min(errors[:-PATIENCE])
-        if now.typical <= enough or slow:
+        moved = np.abs(refined.solution.change[:count]).max(initial=0.0)
+        if slow or (now.typical <= enough and moved < STILL):
             break
     there = _at_bounds(best)
     now = judge(there)

@@ -6,6 +6,7 @@ Both formats hold, under the same names (attributes are 0-d arrays in NPZ):
     time        (time,) or (trajectory, time)       s
     contact     (trajectory, time)                  optional; the step that ends here had a contact
     length      (trajectory,)                       optional; valid samples, the rest is padding
+    group       (trajectory,)                       optional; the session a trajectory is from
     attributes  dt, units, task, source, carom_version, checksum
 
 `checksum` is a SHA-256 over everything else. It and all other attributes may be missing, and so may
@@ -34,7 +35,7 @@ STEP_TOLERANCE = 1e-6
 """Largest difference of two time steps that count as equal, relative to the step."""
 
 STATE_AXES = ("trajectory", "time", "point", "axis")
-ARRAYS = ("x", "v", "time", "contact", "length")
+ARRAYS = ("x", "v", "time", "contact", "length", "group")
 TEXTS = ("units", "task", "source", "carom_version")
 ATTRIBUTES = ("checksum", "dt", *TEXTS)
 
@@ -44,7 +45,8 @@ class Recording(eqx.Module):
 
     `x`, `v` are positions and velocities in m and m/s; `contact` says whether the step that ends at
     a sample had an active contact, None where that was not recorded; `time` in s; `length` is the
-    number of valid samples of each trajectory, beyond which is padding of any value; `dt` the time
+    number of valid samples of each trajectory, beyond which is padding of any value; `group` its
+    session, None where each stands alone (trajectories of one session are alike); `dt` the time
     step in s; `task` the task's name or "", `source` where the data come from, `carom_version` what
     wrote the file.
     """
@@ -54,6 +56,7 @@ class Recording(eqx.Module):
     contact: Bool[np.ndarray, "N T"] | None
     time: Float64[np.ndarray, " T"]
     length: Int64[np.ndarray, " N"]
+    group: Int64[np.ndarray, " N"] | None
     dt: float = eqx.field(static=True)
     units: str = eqx.field(static=True)
     task: str = eqx.field(static=True)
@@ -75,6 +78,7 @@ class Recording(eqx.Module):
         dt: Any = None,
         contact: Any = None,
         length: Any = None,
+        group: Any = None,
         units: str = "SI",
         task: str = "",
         source: str = "",
@@ -97,9 +101,10 @@ class Recording(eqx.Module):
         _check_finite("v", v, valid, STATE_AXES)
         time, dt = _clock(time, dt, valid)
         contact = None if contact is None else _flags(contact, x.shape)
+        group = None if group is None else _groups(group, x.shape[0])
         texts = {"units": units, "task": task, "source": source, "carom_version": carom_version}
         texts = {name: _text(name, text) for name, text in texts.items()}
-        return cls(x=x, v=v, contact=contact, time=time, length=length, dt=dt, **texts)
+        return cls(x=x, v=v, contact=contact, time=time, length=length, group=group, dt=dt, **texts)
 
     @property
     def n_trajectories(self) -> int:
@@ -116,8 +121,8 @@ class Recording(eqx.Module):
     def select(self, indices: Any) -> "Recording":
         """The trajectories with these indices, or where a mask is true, in this order."""
         rows = np.arange(self.n_trajectories)[indices].reshape(-1)
-        contact = None if self.contact is None else self.contact[rows]
-        return replace(self, x=self.x[rows], v=self.v[rows], contact=contact, length=self.length[rows])
+        contact, group = (None if part is None else part[rows] for part in (self.contact, self.group))
+        return replace(self, x=self.x[rows], v=self.v[rows], contact=contact, length=self.length[rows], group=group)
 
 
 def load_recording(path: str | os.PathLike[str], *, task: str | None = None) -> Recording:
@@ -163,8 +168,7 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
         fields = {name: getattr(recording, name) for name in (*ARRAYS, "dt", *TEXTS)}
         checked = Recording.of(**{**fields, "carom_version": _version()})
         content = {name: getattr(checked, name) for name in fields}
-        if checked.contact is None:
-            del content["contact"]
+        content = {name: value for name, value in content.items() if value is not None}
         if (checked.length == checked.x.shape[1]).all():
             del content["length"]
         write_whole(path, encode({"checksum": _checksum(content), **content}).getbuffer())
@@ -231,6 +235,14 @@ def _flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
     wanted = "hold true and false, or 0 and 1"
     _check(good, "contact", wanted, array.dtype, "convert it to bool or remove it")
     return array.astype(bool)
+
+
+def _groups(value: Any, count: int) -> Int64[np.ndarray, " N"]:
+    array = np.asarray(value)
+    good = array.dtype.kind in "iu" and array.shape == (count,)
+    was = f"{array.dtype} of shape {array.shape}"
+    _check(good, "group", f"be {count} integers, one a trajectory", was, "number the sessions, or remove it")
+    return array.astype(np.int64)
 
 
 def _text(name: str, value: Any) -> str:

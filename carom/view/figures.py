@@ -14,6 +14,7 @@ from matplotlib.ticker import FixedLocator, LogFormatterMathtext, LogLocator, Ma
 from carom.errors import CaromError
 from carom.view.style import (
     BLUE,
+    DASHES,
     GREEN,
     INK,
     MUTED,
@@ -33,7 +34,6 @@ MOST_NAMED = len(PALETTE)
 SMALLEST_SPAN = 0.1
 """What the axis of a property spans at least: smaller changes are for the panel of errors."""
 
-DASHES = (0, (4, 2))
 
 KEPT: dict[str, Any] = {"marker": "D", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.8}
 """How the values of the system that was kept are marked."""

@@ -1,6 +1,7 @@
 """What pictures of a system in motion consist of: bodies, links, walls, contacts, and from where they are seen."""
 
-from itertools import pairwise
+from collections.abc import Iterator
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.patches import Polygon
 
+from carom.contact.boxes import CornerPlane
 from carom.contact.candidates import DiskDisk, DiskPlane
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.constraints import Distance, Joint, Tether
@@ -50,7 +52,7 @@ class Lines(NamedTuple):
 
 
 def lines_of(system: System) -> Lines:
-    """Rods, and a line from the center of each rigid body along its axes to its rim."""
+    """Rods, the edges of boxes, and a line from the center of each other rigid body along its axes to its rim."""
     n, dim = system.n_points, system.dim
     unit, zero = np.eye(n), np.zeros(dim)
     weights, offset, anchors = [], [], []
@@ -62,8 +64,18 @@ def lines_of(system: System) -> Lines:
             weights.append([unit[link.i if isinstance(link, Tether) else link.first], 0 * unit[0]])
             anchors.append(np.asarray(link.anchor, float))
             offset.append([zero, anchors[-1]])
-    for body, center in zip(system.bodies, system.table.center, strict=True):
-        if isinstance(body, RigidBody):
+    boxes = _boxes(system)
+    for index, half in boxes.items():
+        center, axes = system.table.center[index], list(system.table.axes[index])
+        for first, second in _edges(dim):
+            ends = []
+            for corner in (first, second):
+                point = unit[center] * (1 - np.sum(corner * half))
+                ends.append(point + (corner * half) @ unit[axes])
+            weights.append(ends)
+            offset.append([zero, zero])
+    for index, (body, center) in enumerate(zip(system.bodies, system.table.center, strict=True)):
+        if isinstance(body, RigidBody) and index not in boxes:
             # A turning disk shows one spoke, a body in 3D its three axes.
             for axis in range(1 if dim == 2 else 3):
                 reach = float(body.radius) or 0.1
@@ -75,6 +87,22 @@ def lines_of(system: System) -> Lines:
         np.reshape(offset, (-1, 2, dim)),
         np.reshape(anchors, (-1, dim)),
     )
+
+
+def _boxes(system: System) -> dict[int, np.ndarray]:
+    """Half widths of the bodies that are boxes."""
+    corners = (contact for contact in system.contacts if isinstance(contact, CornerPlane))
+    return {body: np.asarray(contact.half_widths, float) for contact in corners for body in contact.bodies}
+
+
+def _edges(dim: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pairs of corners of a box, as signs of their coordinates, that differ in one."""
+    for signs in product((-1.0, 1.0), repeat=dim):
+        for axis in range(dim):
+            if signs[axis] < 0:
+                other = np.array(signs)
+                other[axis] = 1.0
+                yield np.array(signs), other
 
 
 def touching(system: System, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +139,7 @@ def walls_of(system: System) -> list[Wall]:
     """Each plane once."""
     found: dict[tuple, Wall] = {}
     for contact in system.contacts:
-        if isinstance(contact, DiskPlane):
+        if isinstance(contact, DiskPlane | CornerPlane):
             wall = Wall(np.asarray(contact.point, float), np.asarray(contact.normal, float))
             key = (*wall.normal.round(9), round(float(wall.point @ wall.normal), 9))
             found.setdefault(key, wall)
@@ -121,7 +149,9 @@ def walls_of(system: System) -> list[Wall]:
 def box_of(system: System, trajectory: Trajectory, anchors: np.ndarray) -> np.ndarray:
     """Lower and upper corner (2, d) of all that the trajectory reaches."""
     x = positions_of(trajectory, FAR)[:, list(system.table.center)]
-    radii = np.asarray(system.radii, float)[:, None]
+    radii = np.array(system.radii, float)[:, None]
+    for body, half in _boxes(system).items():
+        radii[body] = np.linalg.norm(half)
     reached = np.concatenate([(x - radii).reshape(-1, system.dim), (x + radii).reshape(-1, system.dim), anchors])
     reached = reached[np.isfinite(reached).all(axis=1)]
     return np.array([reached.min(axis=0), reached.max(axis=0)])

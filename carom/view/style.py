@@ -31,6 +31,8 @@ PAPER = "#FFFFFF"
 TINT, TINT_EDGE, HATCH = "#BBD6EA", "#6FA8CF", "#D3D8DE"
 """Bodies and their edges; the hatching of walls."""
 
+DASHES = (0, (4, 2))
+"""Of lines that show the truth."""
 DPI = 160
 """Pixels an inch of the figures."""
 

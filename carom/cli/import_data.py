@@ -1,0 +1,83 @@
+"""`carom import poses FILE`: a recording of poses as a trajectory file."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import equinox as eqx
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from carom.atomic import check_writable
+from carom.checks import require
+from carom.cli.arguments import FilePath
+
+Kind = Annotated[Literal["poses"], tyro.conf.Positional, tyro.conf.arg(metavar="poses")]
+Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """Turn recorded poses of a tossed body (positions and quaternions, NPZ or HDF5) into a carom trajectory file.
+
+    Says what looks wrong: scale, gravity, penetration, bias, copies, late velocities. docs/real-data.md has the format.
+    """
+
+    kind: Kind
+    """What the file holds."""
+    file: Source
+    """Pose file."""
+    size: float
+    """Nominal width of the body in m."""
+    mass: float | None = None
+    """Mass in kg, noted in the file; motion under gravity and contact does not depend on it."""
+    out: FilePath = None
+    """File to write (.h5, .hdf5 or .npz); by default FILE-trajectories.h5."""
+    scale: float = 1.0
+    """Multiplies all recorded lengths."""
+    estimate_velocities: bool = False
+    """Estimate velocities from poses even if the file has some."""
+    keep_copies: bool = False
+    """Keep trajectories that the file says are copies of others."""
+    task: str = "cube"
+    """Task that the trajectories are of."""
+
+    def after_interrupt(self) -> str:
+        """What to say when interrupted."""
+        return "Nothing was written."
+
+    def run(self) -> None:
+        """Do it."""
+        from carom.simulation.files import save_recording
+        from carom.simulation.pose_checks import check_poses, flight_noise
+        from carom.simulation.poses import at_samples, load_poses, velocity_lag, with_velocities
+
+        require(self.size > 0, f"size must be a positive length in m; it was {self.size}.")
+        require(self.scale > 0, f"scale must be positive; it was {self.scale}.")
+        require(self.mass is None or self.mass > 0, f"mass must be positive, in kg; it was {self.mass}.")
+        out = self.out or self.file.with_name(f"{self.file.stem}-trajectories.h5")
+        check_writable(out)
+        poses, copies = load_poses(self.file, keep_copies=self.keep_copies)
+        poses = eqx.tree_at(lambda p: p.position, poses, poses.position * self.scale)
+        if poses.velocity is not None:
+            poses = eqx.tree_at(lambda p: p.velocity, poses, poses.velocity * self.scale)
+        findings = check_poses(poses, self.size)
+        if self.estimate_velocities or poses.velocity is None or poses.omega is None:
+            poses = with_velocities(poses)
+        elif abs(velocity_lag(poses)) > 0.25 * poses.dt:
+            # Differences of the past are half a sample old; what is measured is that, with noise.
+            poses = at_samples(poses, 0.5 * poses.dt * round(2 * velocity_lag(poses) / poses.dt))
+        about = f"{self.file.name}, width {self.size} m" + (f", mass {self.mass} kg" if self.mass else "")
+        save_recording(out, poses.to_recording(task=self.task, source=about))
+        console = Console()
+        table = Table(title=f"{self.file.name}: {len(poses.length)} trajectories at {1 / poses.dt:.0f} Hz")
+        for name in ("check", "found", "what to do"):
+            table.add_column(name)
+        for finding in findings:
+            table.add_row(*finding)
+        table.add_row("noise of heights in flight", f"{flight_noise(poses) * 1e3:.3f} mm", "")
+        console.print(table)
+        if copies:
+            console.print(f"{copies} trajectories that are copies of others were left out.", highlight=False)
+        console.print(f"Written to {out}", soft_wrap=True, highlight=False)

@@ -1,0 +1,134 @@
+"""Tossed bodies on the command line: learn from recorded poses, and measure by the protocols."""
+
+import csv
+import dataclasses
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from carom.atomic import write_whole
+from carom.learning.dataset import trajectory_of
+from carom.learning.model_file import load_model_into, save_model
+from carom.learning.protocols import (
+    Protocol,
+    TossErrors,
+    box_of,
+    paired_difference,
+    protocol_starts,
+    toss_errors,
+)
+from carom.learning.run import MODEL, REPORT, RunFolder
+from carom.learning.tosses import TossConfig, TossReport, learn_tosses, predict_tosses
+from carom.simulation.files import Recording
+from carom.simulation.rollout import Trajectory
+from carom.system import System
+
+PUBLISHED = {"friction": 0.18, "restitution": 0.125}
+"""Of the acrylic cube (Pfrommer, Halm, Posa, CoRL 2020)."""
+
+
+def learn_and_measure(
+    console: Console, run: RunFolder, skeleton: System, train: Recording, val: Recording, config: TossConfig
+) -> None:
+    """Learn from `train`, measure on `val` by protocol A, and write all that into the run folder."""
+    system, report = learn_tosses(skeleton, train, config, run=run)
+    save_model(run.path / MODEL, system)
+    console.print(estimate_table(report, skeleton.name))
+    width = 2 * float(np.min(box_of(skeleton).half_widths))
+    measures = measure(console, run, system, val, "A", nominal_width(skeleton, width))
+    run.write_json(REPORT, {"learned": dataclasses.asdict(report), "evaluation": measures})
+    console.print(f"Done ({report.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
+
+
+def nominal_width(skeleton: System, width: float) -> float:
+    """The width that errors are given in: the cube's nominal one, whatever its recordings say."""
+    return 0.1048 if skeleton.name == "cube" else width
+
+
+def estimate_table(report: TossReport, name: str) -> Table:
+    """What was learned, with standard errors, and what was published for the cube."""
+    table = Table(title=f"Learned from {report.tosses} tosses")
+    for column in ("quantity", "learned", "standard error", "published"):
+        table.add_column(column, justify="left" if column == "quantity" else "right")
+    for quantity, estimate in report.estimates.items():
+        known = PUBLISHED.get(quantity) if name == "cube" else None
+        table.add_row(
+            f"{quantity} ({estimate.unit})" if estimate.unit else quantity,
+            f"{estimate.value:.5g}",
+            "" if estimate.standard_error is None else f"{estimate.standard_error:.1g}",
+            "" if known is None else f"{known}",
+        )
+    return table
+
+
+def measure(
+    console: Console,
+    run: RunFolder,
+    system: System,
+    recording: Recording,
+    protocol: Protocol,
+    width: float,
+    baseline: tuple[str, System] | None = None,
+) -> dict[str, Any]:
+    """Predict every toss and print, write and draw how far off that is; against a `baseline` too, toss by toss."""
+    data = protocol_starts(recording, protocol, width)
+    predicted = predict_tosses(system, data)
+    errors = toss_errors(system, data, predicted, width)
+    out: dict[str, Any] = {"protocol": protocol, "tosses": len(errors.position), **errors.summary()}
+    shown = {"learned": errors}
+    table = Table(title=f"Protocol {protocol}: {len(errors.position)} tosses")
+    for column in ("error", "mean", "sd", "median"):
+        table.add_column(column, justify="left" if column == "error" else "right")
+    units = {"position": "% of the width", "rotation": "degrees", "penetration": "% of the width"}
+    for name, unit in units.items():
+        row = out[name]
+        table.add_row(f"{name} ({unit})", *(f"{row[part]:.2f}" for part in ("mean", "sd", "median")))
+    console.print(table)
+    if baseline is not None:
+        name, other = baseline
+        shown[name] = toss_errors(other, data, predict_tosses(other, data), width)
+        out["difference"] = {}
+        for kind in ("position", "rotation"):
+            found = paired_difference(getattr(errors, kind), getattr(shown[name], kind), data.group)
+            out["difference"][kind] = found
+            console.print(
+                f"{kind}: {found['mean']:+.2f} [{found['lower']:+.2f}, {found['upper']:+.2f}] {units[kind]} against "
+                f"{name} (95 %, bootstrap over {found['sessions']} sessions)",
+                highlight=False,
+            )
+    write_errors(run.path / f"toss_errors_{protocol}.csv", data, errors)
+    _pictures(run, system, data, predicted, errors, shown)
+    return out
+
+
+def write_errors(path: Path, recording: Recording, errors: TossErrors) -> None:
+    """One line a toss."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["toss", "session", "samples", "position_percent", "rotation_degrees", "penetration_percent"])
+    for k, length in enumerate(recording.length):
+        session = "" if recording.group is None else int(recording.group[k])
+        numbers = (errors.position[k], errors.rotation[k], errors.penetration[k])
+        writer.writerow([k, session, int(length), *(f"{number:.4f}" for number in numbers)])
+    write_whole(path, text.getvalue().encode())
+
+
+def _pictures(run: RunFolder, system, data: Recording, predicted, errors: TossErrors, shown) -> None:
+    from carom.view import animate, tosses  # matplotlib is slow to import
+
+    tosses.toss_figure(system, data, predicted, errors, run.path / "tosses.png")
+    tosses.error_figure(shown, run.path / "toss_errors.png")
+    k = tosses.chosen_tosses(errors)["median"]
+    true = trajectory_of(data, k)
+    count = len(true.time)
+    guess = Trajectory(predicted[k, :count], true.v, true.contact, true.time, true.overflow, true.residual)
+    animate.animate(system, true, guess, run.path / "prediction.gif")
+
+
+def other_run(folder: Path, skeleton: System) -> tuple[str, System]:
+    """The system of another run, to compare with, by the folder's name."""
+    return folder.name, load_model_into(RunFolder.open(folder).path / MODEL, skeleton)

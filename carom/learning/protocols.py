@@ -1,0 +1,124 @@
+"""How predictions of tossed bodies are measured: errors of position and rotation, penetration, by toss."""
+
+import dataclasses
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from carom.checks import require
+from carom.contact.boxes import CornerPlane
+from carom.mechanics.bodies import recover_pose
+from carom.simulation.files import Recording
+from carom.system import System
+
+Protocol = Literal["A", "B"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TossErrors:
+    """By toss: mean errors of position and penetration (% of the width) and of rotation (degrees)."""
+
+    position: Float[np.ndarray, " N"]
+    rotation: Float[np.ndarray, " N"]
+    penetration: Float[np.ndarray, " N"]
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Mean, standard deviation and median of each."""
+        parts = {name: getattr(self, name) for name in ("position", "rotation", "penetration")}
+        return {
+            name: {"mean": float(np.mean(part)), "sd": float(np.std(part)), "median": float(np.median(part))}
+            for name, part in parts.items()
+        }
+
+
+def pose_errors(
+    predicted: Float[np.ndarray, "N T 4 3"], recorded: Float[np.ndarray, "N T 4 3"], length: Int[np.ndarray, " N"]
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Mean distance of the centres (m) and mean geodesic angle (rad) of each toss, over its `length` samples."""
+    valid = np.arange(recorded.shape[1]) < length[:, None]
+    distance = np.linalg.norm(predicted[:, :, 0] - recorded[:, :, 0], axis=-1)
+    axes = [part[:, :, 1:] - part[:, :, :1] for part in (predicted, recorded)]
+    cosine = (np.einsum("ntij,ntij->nt", *axes) - 1) / 2
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    return tuple(np.where(valid, part, 0).sum(axis=1) / valid.sum(axis=1) for part in (distance, angle))  # pyright: ignore[reportReturnType]
+
+
+def protocol_starts(recording: Recording, protocol: Protocol, width: float) -> Recording:
+    """The recording as a protocol predicts it: each toss from the sample that it starts from.
+
+    A: the first sample. B: the sample before the centre first falls below `sqrt(3) / 2 width`, the height at which a
+    corner can touch, with the velocities refitted on the flight before it (Acosta, Yang, Posa, RA-L 2022).
+    """
+    require(protocol in ("A", "B"), f"protocol must be A or B; it was {protocol!r}.")
+    if protocol == "A":
+        return recording
+    starts, states = [], []
+    for k, length in enumerate(recording.length):
+        low = recording.x[k, :length, 0, 2] < np.sqrt(3) / 2 * width
+        start = max(int(low.argmax()) - 1, 0) if low.any() else 0
+        starts.append(start)
+        states.append(_flight_velocity(recording.x[k, : start + 1], recording.v[k, start], recording.dt))
+    length = recording.length - np.array(starts)
+    rows = (np.array(starts)[:, None] + np.arange(length.max())).clip(max=recording.x.shape[1] - 1)
+    x, v = (part[np.arange(len(starts))[:, None], rows] for part in (recording.x, recording.v))
+    v[:, 0] = np.array(states)
+    return Recording.of(
+        x, v, dt=recording.dt, length=length, group=recording.group, task=recording.task, source=recording.source
+    )
+
+
+def _flight_velocity(x: Float[np.ndarray, "t 4 3"], recorded: Float[np.ndarray, "4 3"], dt: float):
+    """Velocities of the points at the end of a flight: a parabola for the centre, one rate of turning for the axes."""
+    if len(x) < 4:
+        return recorded
+    from scipy.spatial.transform import Rotation
+
+    time = (np.arange(len(x)) - len(x) + 1) * dt
+    center = np.polyfit(time, x[:, 0], 2)[1]
+    _, rotation = (np.asarray(part) for part in recover_pose(jnp.asarray(x)))
+    turns = (Rotation.from_matrix(rotation) * Rotation.from_matrix(rotation[-1]).inv()).as_rotvec()
+    omega = np.sum(turns * time[:, None], axis=0) / np.sum(time**2)
+    return center + np.concatenate([np.zeros((1, 3)), np.cross(omega, x[-1, 1:] - x[-1, :1])])
+
+
+def lowest_corner(system: System, x: Float[np.ndarray, "N T 4 3"]) -> Float[np.ndarray, "N T"]:
+    """Height of the lowest corner above the plane (m); negative where it penetrates."""
+    import jax
+
+    gaps = jax.jit(jax.vmap(jax.vmap(system.gaps)))(jnp.asarray(x))
+    return np.asarray(jnp.min(gaps, axis=-1))
+
+
+def toss_errors(
+    system: System, recording: Recording, predicted: Float[np.ndarray, "N T 4 3"], width: float
+) -> TossErrors:
+    """Errors of predicted tosses, in % of `width` (m) and degrees, over each toss to its own end."""
+    distance, angle = pose_errors(predicted, recording.x, recording.length)
+    depth = np.maximum(-lowest_corner(system, predicted), 0)
+    valid = recording.valid
+    inside = np.where(valid, depth, 0).sum(axis=1) / valid.sum(axis=1)
+    return TossErrors(100 * distance / width, np.degrees(angle), 100 * inside / width)
+
+
+def box_of(system: System) -> CornerPlane:
+    """The contact of a box with a plane. Raises `CaromError` for a system without one."""
+    found = [contact for contact in system.contacts if isinstance(contact, CornerPlane)]
+    require(len(found) > 0, "protocols A and B are for tossed boxes; this system has no CornerPlane contact.")
+    return found[0]
+
+
+def paired_difference(
+    first: Float[np.ndarray, " N"], second: Float[np.ndarray, " N"], group: Int[np.ndarray, " N"] | None, seed: int = 0
+) -> dict[str, Any]:
+    """Mean of `first - second` by toss, with a 95 % interval by 10 000 bootstrap draws of whole sessions."""
+    difference = first - second
+    each = np.arange(len(difference)) if group is None else np.asarray(group)
+    sessions = np.unique(each)
+    sums = np.array([difference[each == s].sum() for s in sessions])
+    counts = np.array([(each == s).sum() for s in sessions])
+    draws = np.random.default_rng(seed).integers(len(sessions), size=(10000, len(sessions)))
+    means = sums[draws].sum(axis=1) / counts[draws].sum(axis=1)
+    lower, upper = np.quantile(means, [0.025, 0.975])
+    return {"mean": float(difference.mean()), "lower": float(lower), "upper": float(upper), "sessions": len(sessions)}

@@ -1,0 +1,431 @@
+"""Learning a body that is tossed onto a plane from recorded poses: geometry, inertia, gravity, friction, restitution.
+
+Real recordings are noisy, and a rigid body that tumbles is chaotic: errors of one step say little, those of a whole
+toss say little more. So the fit goes by segments: each starts at a recorded state in flight shortly before an impact,
+is predicted over a horizon, and compared with the recorded poses. Gauss-Newton steps with the robust estimator of
+`robust.py`, clustered by toss or session, over horizons that grow, give the parameters and their standard errors. At
+the end whole tosses are fitted, from their first states, in the measure in which predictions are judged, by the simplex
+search of Nelder and Mead, which needs no derivatives: those through a whole toss are as large as they are useless.
+
+Every evaluation of that search is a line of the run's metrics, from which a run that was stopped goes on.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Array, Float, Int
+
+from carom.checks import require
+from carom.contact.boxes import CornerPlane
+from carom.contact.impulses import SpeedCM
+from carom.learning.dataset import closed_contacts
+from carom.learning.progress import LoopProgress
+from carom.learning.protocols import pose_errors
+from carom.learning.robust import Blocks, Solution, solve
+from carom.learning.run import RunFolder
+from carom.mechanics.bodies import RigidBody
+from carom.mechanics.potentials import Gravity
+from carom.simulation.files import Recording
+from carom.simulation.impact import Stepper
+from carom.simulation.rollout import rollout
+from carom.system import System
+
+Quantity = Literal[
+    "half_width",
+    "corner_radius",
+    "inertia",
+    "gravity",
+    "friction",
+    "restitution",
+    "restitution_decay",
+    "friction_decay",
+    "table_height",
+    "table_tilt_x",
+    "table_tilt_y",
+]
+PLAIN: tuple[Quantity, ...] = ("half_width", "corner_radius", "inertia", "friction", "restitution")
+
+
+class Parameter(NamedTuple):
+    """One number of a system: how to read and to change it, its bounds, and a change of it that matters."""
+
+    read: Callable[[System], Any]
+    write: Callable[[System, Float[Array, ""]], System]
+    lower: float
+    upper: float
+    scale: float
+    unit: str
+
+
+def _leaf(where: Callable[[System], Any], scale: float, unit: str, lower=0.0, upper=np.inf) -> Parameter:
+    """A number that stands in one array, in all of its places."""
+
+    def write(system, value):
+        return eqx.tree_at(where, system, jnp.broadcast_to(value, where(system).shape).astype(where(system).dtype))
+
+    return Parameter(lambda system: where(system).reshape(-1)[0], write, lower, upper, scale, unit)
+
+
+def _plane(system: System) -> CornerPlane:
+    return next(contact for contact in system.contacts if isinstance(contact, CornerPlane))
+
+
+def _acceleration(system: Any) -> Float[Array, " d"]:
+    return system.potential.acceleration
+
+
+def _gravity(system: System, value):
+    g = _acceleration(system)
+    return eqx.tree_at(_acceleration, system, value * g / jnp.linalg.norm(g))
+
+
+def _moments(system: Any) -> Float[Array, " d"]:
+    return system.bodies[0].moments
+
+
+def _inertia(system: System, value):
+    """The mean of the three moments of inertia is two thirds of the sum of the second moments."""
+    moments = _moments(system)
+    return eqx.tree_at(_moments, system, moments / jnp.sum(moments) * 1.5 * value)
+
+
+def _speed(system: Any) -> Any:
+    return system.contact_model
+
+
+def _tilt(axis: int) -> Parameter:
+    def write(system, value):
+        normal = _plane(system).normal
+        tilted = normal.at[axis].set(value * normal[2])
+        return eqx.tree_at(lambda s: _plane(s).normal, system, tilted / jnp.linalg.norm(tilted))
+
+    return Parameter(lambda s: _plane(s).normal[axis] / _plane(s).normal[2], write, -0.1, 0.1, 0.005, "rad")
+
+
+PARAMETERS: dict[str, Parameter] = {
+    "half_width": _leaf(lambda s: _plane(s).half_widths, 5e-4, "m", 1e-6),
+    "corner_radius": _leaf(lambda s: _plane(s).corner_radius, 2e-3, "m"),
+    "inertia": Parameter(lambda s: jnp.sum(_moments(s)) * 2 / 3, _inertia, 1e-9, np.inf, 6e-5, "kg m^2"),
+    "gravity": Parameter(lambda s: jnp.linalg.norm(_acceleration(s)), _gravity, 0.0, np.inf, 0.1, "m/s^2"),
+    "friction": _leaf(lambda s: s.friction, 0.03, ""),
+    "restitution": _leaf(lambda s: s.restitution, 0.08, "", 0.0, 1.0),
+    "restitution_decay": _leaf(lambda s: _speed(s).restitution_decay, 0.5, "s/m", -2.0, 10.0),
+    "friction_decay": _leaf(lambda s: _speed(s).friction_decay, 0.2, "s/m", -2.0, 10.0),
+    "table_height": Parameter(
+        lambda s: _plane(s).point[2],
+        lambda s, value: eqx.tree_at(lambda s: _plane(s).point, s, _plane(s).point.at[2].set(value)),
+        -0.1,
+        0.1,
+        5e-4,
+        "m",
+    ),
+    "table_tilt_x": _tilt(0),
+    "table_tilt_y": _tilt(1),
+}
+"""What can be learned of a tossed body."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TossConfig:
+    """How to learn from recorded tosses."""
+
+    learn_of_toss: tuple[Quantity, ...] = PLAIN
+    """What is learned of a tossed body; all else is taken from the task. The decays make friction and restitution
+    depend on speed; gravity, table height and tilts absorb biases of the recording."""
+    horizons: tuple[int, ...] = (8, 16)
+    """Samples that segments around impacts are predicted over, one stage after the other."""
+    segments: int = 1000
+    """Most segments in a stage."""
+    toss_rounds: int = 4
+    """Gauss-Newton steps in each stage."""
+    evaluations: int = 150
+    """Most evaluations of whole tosses at the end; 0: leave it at the segments."""
+    toss_samples: int = 120
+    """Samples of a toss that are fitted at the end: bodies rest after that."""
+    substeps: int = 1
+    """Steps of the simulation in one sample."""
+    toss_seed: int = 0
+    """Seed of which segments are used where there are more."""
+
+    def check(self) -> None:
+        """Raise `CaromError` for a value that cannot be."""
+        unknown = set(self.learn_of_toss) - set(get_args(Quantity))
+        require(
+            not unknown and len(self.learn_of_toss) > 0,
+            f"learn_of_toss must name some of {', '.join(get_args(Quantity))}; it was {self.learn_of_toss}.",
+        )
+        for name in ("segments", "toss_rounds", "toss_samples", "substeps"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
+        require(self.evaluations >= 0, f"evaluations must not be negative; it was {self.evaluations}.")
+        require(all(h >= 2 for h in self.horizons), f"horizons must be at least 2 samples; they were {self.horizons}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class TossEstimate:
+    """A learned number, its unit, and its standard error by the segments (None: not told by them)."""
+
+    value: float
+    standard_error: float | None
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class TossReport:
+    """What a fit came to: the estimates, and the mean errors of whole training tosses (share of the width, rad)."""
+
+    estimates: dict[str, TossEstimate]
+    position: float
+    rotation: float
+    tosses: int
+    segments: int
+    evaluations: int
+    seconds: float
+
+
+def can_learn_tosses(system: System) -> bool:
+    """Whether this is one rigid body in 3D whose corners meet a plane under gravity."""
+    return (
+        len(system.bodies) == 1
+        and isinstance(system.bodies[0], RigidBody)
+        and any(isinstance(contact, CornerPlane) for contact in system.contacts)
+        and isinstance(system.potential, Gravity)
+    )
+
+
+def prepared(system: System, config: TossConfig) -> System:
+    """The system with a contact model that has what is to be learned, and room for the contacts of a face and more."""
+    if {"restitution_decay", "friction_decay"} & set(config.learn_of_toss):
+        kept = isinstance(system.contact_model, SpeedCM)
+        system = system if kept else system.with_contact_model(SpeedCM())
+    return system.with_max_active(4)
+
+
+def read_values(system: System, names: Sequence[str]) -> Float[np.ndarray, " p"]:
+    """The numbers of these names."""
+    return np.array([float(PARAMETERS[name].read(system)) for name in names])
+
+
+def with_values(system: System, names: Sequence[str], values) -> System:
+    """The system with other numbers of these names."""
+    for name, value in zip(names, values, strict=True):
+        system = PARAMETERS[name].write(system, value)
+    return system
+
+
+def _limits(names: Sequence[str]) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    lower, upper = np.array([(PARAMETERS[name].lower, PARAMETERS[name].upper) for name in names]).T
+    return lower, upper
+
+
+# --- predictions --------------------------------------------------------------------------------------------------
+
+
+def toss_stepper(dt: float, substeps: int = 1) -> Stepper:
+    """How tosses are simulated: contacts act when they close, which needs no small steps."""
+    return Stepper(dt=jnp.asarray(dt / substeps), impact="event", compensation_steps=8.0 * substeps)
+
+
+def _predict(system: System, x0, v0, stepper: Stepper, samples: int, substeps: int):
+    return jax.vmap(lambda x, v: rollout(system, x, v, stepper, samples * substeps).x[::substeps])(x0, v0)
+
+
+@eqx.filter_jit
+def _tosses(system, names, values, x0, v0, stepper, samples, substeps):
+    return _predict(with_values(system, names, values), x0, v0, stepper, samples, substeps)
+
+
+@eqx.filter_jit
+def _segments(system, names, values, x0, v0, end, stepper, samples, substeps):
+    """Residuals (S, samples, points, 3) of segments and their derivatives by the values, in one direction each."""
+
+    def residual(values):
+        x = _predict(with_values(system, names, values), x0, v0, stepper, samples, substeps)
+        return x[:, 1:] - end
+
+    basis = jnp.eye(len(values))
+    out, columns = jax.vmap(lambda t: jax.jvp(residual, (values,), (t,)), out_axes=(None, -1))(basis)
+    return out, columns
+
+
+def predict_tosses(system: System, recording: Recording, *, samples: int | None = None, substeps: int = 1):
+    """Points (N, T, 4, 3) of all tosses from their first recorded states, `samples` steps (all by default)."""
+    samples = recording.x.shape[1] - 1 if samples is None else min(samples, recording.x.shape[1] - 1)
+    stepper = toss_stepper(recording.dt, substeps)
+    x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
+    return np.asarray(_tosses(system.with_max_active(4), (), jnp.zeros(0), x0, v0, stepper, samples, substeps))
+
+
+# --- segments -----------------------------------------------------------------------------------------------------
+
+
+def choose_segments(
+    recording: Recording, system: System, horizon: int, count: int, seed: int
+) -> Int[np.ndarray, "S 2"]:
+    """Starts `(toss, sample)` in flight: no impact near to its velocities, and one within half a horizon."""
+    rng = np.random.default_rng((seed, horizon))
+    near = closed_contacts(recording.x - np.array([0, 0, 1e-3]), system) > 0
+    starts = []
+    for k, length in enumerate(recording.length):
+        for s in range(length - horizon):
+            before, after = near[k, max(0, s - 3) : s + 2], near[k, s + 2 : s + 2 + horizon // 2]
+            if not before.any() and after.any():
+                starts.append((k, s))
+    chosen = np.array(starts, int).reshape(-1, 2)
+    return chosen[np.sort(rng.permutation(len(chosen))[:count])]
+
+
+def _stage(system: System, names, values, recording: Recording, horizon: int, config: TossConfig):
+    """Gauss-Newton steps over one horizon: new values, and the last solution (in units of the scales)."""
+    steps = choose_segments(recording, system, horizon, config.segments, config.toss_seed)
+    require(
+        len(steps) >= 3 * len(names),
+        f"the recording has {len(steps)} segments of {horizon} samples around impacts, too few for {len(names)} "
+        "quantities. Give more tosses, learn less, or use shorter horizons.",
+    )
+    k, s = steps.T
+    x0, v0 = jnp.asarray(recording.x[k, s]), jnp.asarray(recording.v[k, s])
+    end = jnp.asarray(recording.x[k[:, None], s[:, None] + 1 + np.arange(horizon)])
+    size = float(jnp.min(_plane(system).half_widths))
+    # The axes' ends move by as much as the body's surface does.
+    reach = np.concatenate([[1.0], np.full(3, size)])[:, None]
+    scale = np.array([PARAMETERS[name].scale for name in names])
+    lower, upper = _limits(names)
+    cluster = k if recording.group is None else np.asarray(recording.group)[k]
+    stepper = toss_stepper(recording.dt, config.substeps)
+    solution = None
+    for _ in range(config.toss_rounds):
+        residual, columns = map(
+            np.asarray, _segments(system, names, jnp.asarray(values), x0, v0, end, stepper, horizon, config.substeps)
+        )
+        residual = np.concatenate([residual[..., :1, :], residual[..., 1:, :] - residual[..., :1, :]], axis=-2) * reach
+        first = columns[..., :1, :, :]
+        columns = np.concatenate([first, columns[..., 1:, :, :] - first], axis=-3) * reach[..., None] * scale
+        flat = residual.reshape(len(k), -1), columns.reshape(len(k), -1, len(names))
+        fine = np.isfinite(flat[0]).all(axis=1) & np.isfinite(flat[1]).all(axis=(1, 2))
+        blocks = Blocks(flat[0][fine] / 1e-3, flat[1][fine] / 1e-3, cluster[fine], np.zeros(int(fine.sum()), int))
+        solution = solve(
+            blocks,
+            1e-4 * np.eye(len(names)),
+            np.zeros(len(names)),
+            np.maximum((lower - values) / scale, -2.0),
+            np.minimum((upper - values) / scale, 2.0),
+            redescend=True,
+        )
+        values = values + scale * solution.change
+    assert isinstance(solution, Solution)
+    return values, scale * solution.standard_error, len(steps)
+
+
+# --- whole tosses -------------------------------------------------------------------------------------------------
+
+
+def learn_tosses(
+    skeleton: System,
+    recording: Recording,
+    config: TossConfig | None = None,
+    *,
+    run: RunFolder | None = None,
+    progress: bool = True,
+) -> tuple[System, TossReport]:
+    """Learn numbers of a tossed body from recorded tosses; see the top of this file for the method.
+
+    **Arguments:** `skeleton`, one rigid body whose corners meet a plane under gravity: its numbers are where the fit
+    starts; `recording`, of tosses, with velocities at the samples (`carom import poses` makes such); `run`, a folder
+    for metrics, by which a fit that was stopped goes on.
+
+    **Returns:** the learned system and a report.
+
+    **Raises:** `CaromError` for another kind of system, or too few impacts.
+    """
+    import time
+
+    config = TossConfig() if config is None else config
+    config.check()
+    require(
+        can_learn_tosses(skeleton),
+        "tosses are learned for one rigid body with a CornerPlane contact under Gravity; this system is another.",
+    )
+    require(recording.x.shape[2:] == (4, 3), f"tosses have 4 points in 3D; the recording has {recording.x.shape[2:]}.")
+    system, names = prepared(skeleton, config), config.learn_of_toss
+    values = read_values(system, names)
+    known = [] if run is None else run.metrics()
+    started = time.monotonic() - (known[-1]["seconds"] if known else 0.0)
+    errors, count = np.full(len(names), np.nan), 0
+    done = {row["horizon"]: row for row in known if "horizon" in row}
+
+    def log(**row: Any) -> None:
+        if run is not None:
+            run.log({"epoch": 0, "seconds": round(time.monotonic() - started, 3), **row})
+
+    total = len(config.horizons) + config.evaluations
+    with LoopProgress("step", total, shown=progress) as shown:
+        for number, horizon in enumerate(config.horizons, 1):
+            if horizon in done:
+                row = done[horizon]
+                values, errors, count = np.array(row["values"]), np.array(row["errors"], float), row["segments"]
+                continue
+            values, errors, count = _stage(system, names, values, recording, horizon, config)
+            log(horizon=horizon, values=values.tolist(), errors=errors.tolist(), segments=count)
+            shown.update(number, f"segments of {horizon}: " + _named(names, values))
+        before = [row for row in known if "loss" in row]
+        values, made = _search(system, names, values, recording, config, before, log, shown)
+    system = with_values(system, names, jnp.asarray(values))
+    position, rotation = _whole(system, (), np.zeros(0), recording, config)
+    estimates = {
+        name: TossEstimate(float(value), float(error) if np.isfinite(error) else None, PARAMETERS[name].unit)
+        for name, value, error in zip(names, values, errors, strict=True)
+    }
+    seconds = time.monotonic() - started
+    report = TossReport(estimates, float(position.mean()), float(rotation.mean()), len(position), count, made, seconds)
+    return system, report
+
+
+def _whole(system: System, names, values, recording: Recording, config: TossConfig):
+    """Errors of whole tosses from their first states: position (share of the width) and rotation (rad), each (N,)."""
+    samples = min(config.toss_samples, recording.x.shape[1] - 1)
+    stepper = toss_stepper(recording.dt, config.substeps)
+    x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
+    x = np.asarray(_tosses(system, names, jnp.asarray(values), x0, v0, stepper, samples, config.substeps))
+    position, rotation = pose_errors(x, recording.x[:, : samples + 1], np.minimum(recording.length, samples + 1))
+    return position / (2 * float(jnp.min(_plane(system).half_widths))), rotation
+
+
+def _search(system, names, values, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
+    """Nelder and Mead's search over whole tosses, which repeats what `before` holds without computing it again."""
+    if config.evaluations == 0:
+        return values, 0
+    scale = np.array([PARAMETERS[name].scale for name in names])
+    lower, upper = _limits(names)
+    known = {tuple(row["values"]): row["loss"] for row in before}
+    made, best = 0, (np.inf, values)
+    base = values.clip(lower, upper)
+
+    def loss(z) -> float:
+        nonlocal made, best
+        tried = (base + scale * z).clip(lower, upper)
+        made += 1
+        key = tuple(tried.tolist())
+        if key not in known:
+            position, rotation = _whole(system, names, tried, recording, config)
+            # A simulation that ends nowhere is as bad as can be.
+            known[key] = float(np.nan_to_num(position, nan=10.0).mean() + np.nan_to_num(rotation, nan=np.pi).mean())
+            log(values=tried.tolist(), loss=known[key])
+        if known[key] < best[0]:
+            best = known[key], tried
+        shown.update(len(config.horizons) + made, f"whole tosses {best[0]:.4f}: " + _named(names, best[1]))
+        return known[key]
+
+    simplex = np.concatenate([np.zeros((1, len(names))), np.eye(len(names))])
+    options = {"maxfev": config.evaluations, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}
+    scipy.optimize.minimize(loss, np.zeros(len(names)), method="Nelder-Mead", options=options)
+    return best[1], made
+
+
+def _named(names: Sequence[str], values) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
