@@ -11,6 +11,7 @@ from .contact.impulses import CMr as CMr
 from .contact.impulses import ContactModel as ContactModel
 from .contact.impulses import ContactState as ContactState
 from .contact.impulses import Jump as Jump
+from .contact.impulses import SpeedCM as SpeedCM
 from .contact.impulses import contact_impulse as contact_impulse
 from .contact.impulses import solve_impulse as solve_impulse
 from .contact.limits import BendLimit as BendLimit
@@ -26,6 +27,9 @@ from .learning.identify import identify as identify
 from .learning.model_file import save_model as save_model
 from .learning.models import NeuralPotential as NeuralPotential
 from .learning.refine import IdentifyConfig as IdentifyConfig
+from .learning.tosses import TossConfig as TossConfig
+from .learning.tosses import TossReport as TossReport
+from .learning.tosses import learn_tosses as learn_tosses
 from .learning.train import LearnReport as LearnReport
 from .learning.train import learn as learn
 from .mechanics.bodies import Body as Body
@@ -44,6 +48,8 @@ from .simulation.files import Recording as Recording
 from .simulation.files import load_recording as load_recording
 from .simulation.files import save_recording as save_recording
 from .simulation.integrators import RK4 as RK4
+from .simulation.poses import PoseRecording as PoseRecording
+from .simulation.poses import load_poses as load_poses
 from .simulation.rollout import Trajectory as Trajectory
 from .simulation.rollout import simulate as simulate
 from .system import System as System

@@ -10,6 +10,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
 import jaxtyping
+import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -98,3 +99,14 @@ def cp3_data(cp3):
     import carom
 
     return carom.Dataset.split(carom.make_recording(cp3, jax.random.key(0), 24), val=0.25)
+
+
+@pytest.fixture(scope="session")
+def cube_tosses():
+    """60 simulated tosses of the task `cube`, at 148 Hz: positions, velocities (60, 61, 4, 3), and contact (60, 61)."""
+    import carom
+
+    cube = carom.task("cube").with_max_active(4)
+    x0, v0 = carom.sample(cube, jax.random.key(3), 60)
+    motion = carom.simulate(cube, x0, v0, dt=1 / 148, steps=60, impact="event")
+    return tuple(np.array(part) for part in (motion.x, motion.v, motion.contact))

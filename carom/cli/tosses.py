@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -99,6 +100,7 @@ def measure(
                 f"{kind}: {found['mean']:+.2f} [{found['lower']:+.2f}, {found['upper']:+.2f}] {units[kind]} against "
                 f"{name} (95 %, bootstrap over {found['sessions']} sessions)",
                 highlight=False,
+                soft_wrap=True,
             )
     write_errors(run.path / f"toss_errors_{protocol}.csv", data, errors)
     _pictures(run, system, data, predicted, errors, shown)
@@ -125,7 +127,7 @@ def _pictures(run: RunFolder, system, data: Recording, predicted, errors: TossEr
     k = tosses.chosen_tosses(errors)["median"]
     true = trajectory_of(data, k)
     count = len(true.time)
-    guess = Trajectory(predicted[k, :count], true.v, true.contact, true.time, true.overflow, true.residual)
+    guess = Trajectory(jnp.asarray(predicted[k, :count]), true.v, true.contact, true.time, true.overflow, true.residual)
     animate.animate(system, true, guess, run.path / "prediction.gif")
 
 

@@ -76,7 +76,7 @@ def _plane(system: System) -> CornerPlane:
     return next(contact for contact in system.contacts if isinstance(contact, CornerPlane))
 
 
-def _acceleration(system: Any) -> Float[Array, " d"]:
+def _acceleration(system: Any) -> Any:
     return system.potential.acceleration
 
 
@@ -85,7 +85,7 @@ def _gravity(system: System, value):
     return eqx.tree_at(_acceleration, system, value * g / jnp.linalg.norm(g))
 
 
-def _moments(system: Any) -> Float[Array, " d"]:
+def _moments(system: Any) -> Any:
     return system.bodies[0].moments
 
 

@@ -383,7 +383,9 @@ def learn(
 
     with LoopProgress("epoch", config.epochs, int(state.epoch), shown=progress) as shown:
         if refines and restored is None:
-            better = refined(state.unknowns, judge(state.unknowns), whole=False)
+            fit = judge(state.unknowns)
+            log(0, state.unknowns, refinement=0, val_loss=fit.mean)
+            better = refined(state.unknowns, fit, whole=False)
             if better is not None:
                 state = _keep_best(settle(state, better), better[1].mean, 0)
                 if run is not None:

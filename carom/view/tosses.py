@@ -60,7 +60,7 @@ def toss_figure(
         return save_png(figure, path)
 
 
-def _energy(system: System, x: Float[np.ndarray, "T 4 3"], dt: float) -> Float[np.ndarray, " T"]:
+def _energy(system: System, x: Float[np.ndarray, "T 4 3"], dt: float) -> Float[np.ndarray, " inner"]:
     """Energy at the inner samples, above that at rest on a face."""
     v = (x[2:] - x[:-2]) / (2 * dt)
     energy = np.asarray(jax.vmap(system.energy)(jnp.asarray(x[1:-1]), jnp.asarray(v)))

@@ -1,0 +1,254 @@
+"""Learning from recorded tosses, and the protocols that predictions of them are measured by."""
+
+import csv
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from systems import ball_on_floor, refused
+
+import carom
+from carom.cli.main import main
+from carom.learning.protocols import paired_difference, protocol_starts, toss_errors
+from carom.learning.run import RunFolder
+from carom.learning.tosses import (
+    TossConfig,
+    choose_segments,
+    learn_tosses,
+    predict_tosses,
+    prepared,
+    read_values,
+    with_values,
+)
+from carom.simulation.poses import poses_of
+
+DT, WIDTH = 1 / 148, 0.1024
+NAMES = ("inertia", "friction", "restitution")
+CONFIG = TossConfig(learn_of_toss=NAMES, horizons=(8,), segments=200, toss_rounds=4, evaluations=0, toss_samples=50)
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return carom.task("cube")
+
+
+@pytest.fixture(scope="module")
+def tosses(cube_tosses):
+    """60 simulated tosses with errors of 0.05 mm, 2 mm/s and 0.02 rad/s; four sessions."""
+    x, v = (part.copy() for part in cube_tosses[:2])
+    rng = np.random.default_rng(0)
+    x += 5e-5 * rng.normal(size=x[:, :, :1].shape)
+    v += 2e-3 * rng.normal(size=v[:, :, :1].shape)
+    spin = 0.02 * rng.normal(size=(*x.shape[:2], 1, 3))
+    v[:, :, 1:] += np.cross(np.broadcast_to(spin, x[:, :, 1:].shape), x[:, :, 1:] - x[:, :, :1])
+    return carom.Recording.of(x, v, dt=DT, group=np.arange(60) // 15, task="cube")
+
+
+@pytest.fixture(scope="module")
+def moved(cube):
+    return with_values(cube, NAMES, jnp.asarray([7e-4, 0.25, 0.25]))
+
+
+@pytest.mark.slow
+def test_segments_recover_what_noisy_tosses_were_made_with(cube, tosses, moved):
+    truth = read_values(cube, NAMES)
+    system, report = learn_tosses(moved, tosses, CONFIG, progress=False)
+    for name, true in zip(NAMES, truth, strict=True):
+        found = report.estimates[name]
+        assert found.standard_error is not None
+        assert 0 < found.standard_error < 0.1 * max(abs(true), 0.1)
+        assert abs(found.value - true) < 5 * found.standard_error  # four sessions alone
+        assert abs(found.value - true) < 0.05 * true
+    assert np.allclose(read_values(system, NAMES), [e.value for e in report.estimates.values()])
+    assert report.tosses == 60
+    start_position, start_rotation = errors_of(moved, tosses)
+    assert report.position < 0.3 * start_position
+    assert report.rotation < 0.5 * start_rotation
+
+
+def errors_of(system, recording):
+    errors = toss_errors(system, recording, predict_tosses(system, recording), WIDTH)
+    return errors.position.mean() / 100, np.radians(errors.rotation.mean())
+
+
+@pytest.mark.slow
+def test_a_search_that_was_stopped_goes_on_without_computing_again(tosses, moved, tmp_path):
+    config = dataclasses.replace(CONFIG, horizons=(), evaluations=9)
+    whole = RunFolder.create(tmp_path / "whole", {})
+    _, expected = learn_tosses(moved, tosses, config, run=whole, progress=False)
+
+    class StoppedError(Exception):
+        pass
+
+    class Stopping(RunFolder):
+        def log(self, metrics):
+            super().log(metrics)
+            if len(self.metrics()) == 4:
+                raise StoppedError
+
+    with pytest.raises(StoppedError):
+        learn_tosses(moved, tosses, config, run=Stopping.create(tmp_path / "part", {}), progress=False)
+    again = RunFolder.open(tmp_path / "part")
+    _, report = learn_tosses(moved, tosses, config, run=again, progress=False)
+    assert [row["loss"] for row in again.metrics()] == [row["loss"] for row in whole.metrics()]
+    assert report.estimates == expected.estimates
+    assert report.evaluations == 9
+    losses = [row["loss"] for row in whole.metrics()]
+    assert min(losses) < losses[0]
+    assert np.isclose(report.position + report.rotation, min(losses), rtol=1e-9)
+
+
+def test_segments_start_in_flight_before_an_impact(cube, tosses):
+    steps = choose_segments(tosses, cube, 8, 100, 0)
+    assert len(steps) == 100
+    gaps = np.asarray(jax.vmap(jax.vmap(cube.gaps))(jnp.asarray(tosses.x)))
+    closed = (gaps < 1e-3).any(axis=-1)
+    assert not any(closed[k, max(0, s - 3) : s + 2].any() for k, s in steps)
+    assert all(closed[k, s + 2 : s + 6].any() for k, s in steps)
+
+
+def test_values_are_read_as_they_were_written(cube):
+    system = prepared(cube, TossConfig(learn_of_toss=("restitution_decay", "table_tilt_x", "table_height", "gravity")))
+    names = ("restitution_decay", "friction_decay", "table_tilt_x", "table_tilt_y", "table_height", "gravity")
+    values = np.array([0.3, -0.1, 0.01, -0.02, 1e-3, 9.7])
+    changed = with_values(system, names, jnp.asarray(values))
+    assert np.allclose(read_values(changed, names), values, rtol=1e-12)
+    assert np.isclose(jnp.linalg.norm(changed.contacts[0].normal), 1)
+    assert np.allclose(read_values(changed, ("half_width", "inertia")), read_values(cube, ("half_width", "inertia")))
+
+
+def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
+    with refused("one rigid body with a CornerPlane"):
+        learn_tosses(ball_on_floor(), tosses, CONFIG, progress=False)
+    with refused("learn_of_toss must name some of half_width"):
+        TossConfig(learn_of_toss=("mass",)).check()  # pyright: ignore[reportArgumentType]
+    with refused("too few for 3 quantities"):
+        short = carom.Recording.of(tosses.x[:1, :12], tosses.v[:1, :12], dt=DT)
+        learn_tosses(cube, short, CONFIG, progress=False)
+
+
+# --- restitution and friction that depend on speed ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.4])
+def test_fast_impacts_bounce_less(decay):
+    e, speed = 0.8, 2.0
+    ball = ball_on_floor(restitution=e, gravity=0.0).with_contact_model(carom.SpeedCM(decay))
+    x0, v0 = jnp.array([[0.0, 0.105]]), jnp.array([[0.0, -speed]])
+    motion = carom.simulate(ball, x0, v0, dt=0.01, steps=4, impact="event")
+    assert np.isclose(motion.v[-1, 0, 1], speed * e * np.exp(-decay * speed), atol=1e-9)
+    slope = jax.grad(
+        lambda k: carom.simulate(ball.with_contact_model(carom.SpeedCM(k)), x0, v0, dt=0.01, steps=4, impact="event").v[
+            -1, 0, 1
+        ]
+    )(decay)
+    assert np.isclose(slope, -speed * speed * e * np.exp(-decay * speed), rtol=1e-6)
+
+
+def test_fast_sliding_has_less_friction():
+    mu, along, down, decay = 0.3, 3.0, 1.0, 0.2
+    ball = ball_on_floor(friction=mu, gravity=0.0).with_contact_model(carom.SpeedCM(0.0, decay))
+    x0, v0 = jnp.array([[0.0, 0.105]]), jnp.array([[along, -down]])
+    motion = carom.simulate(ball, x0, v0, dt=0.01, steps=2, impact="event", compensation_steps=None)
+    impulse = np.asarray(motion.v[-1, 0]) - [along, -down]  # of a mass of 1 kg
+    assert np.isclose(-impulse[0] / impulse[1], mu * np.exp(-decay * along), atol=1e-9)
+
+
+# --- protocols ----------------------------------------------------------------------------------------------------
+
+
+def test_errors_are_what_was_done_to_the_truth(cube, tosses):
+    system = cube.with_max_active(4)
+    x = tosses.x.copy()
+    errors = toss_errors(system, tosses, x, WIDTH)
+    assert errors.position.max() == 0
+    assert errors.rotation.max() < 1e-5
+    x += np.array([1e-3, 0, 0])
+    assert np.allclose(toss_errors(system, tosses, x, WIDTH).position, 0.1 / WIDTH)
+    turned = Rotation.from_euler("z", 5, degrees=True).apply((x[:, :, 1:] - x[:, :, :1]).reshape(-1, 3))
+    x[:, :, 1:] = x[:, :, :1] + turned.reshape(*x.shape[:2], 3, 3)
+    assert np.allclose(toss_errors(system, tosses, x, WIDTH).rotation, 5)
+    x[..., 2] -= 1.0  # all of it a metre below the table: half of the diagonal and more
+    sunk = toss_errors(system, tosses, x, WIDTH)
+    assert np.all(sunk.penetration > 100 * 0.6 / WIDTH)
+    assert set(sunk.summary()["rotation"]) == {"mean", "sd", "median"}
+
+
+def test_a_toss_counts_to_its_own_end(cube, tosses):
+    short = carom.Recording.of(tosses.x, tosses.v, dt=DT, length=np.full(60, 10))
+    x = tosses.x.copy()
+    x[:, 10:] += 1.0
+    assert toss_errors(cube, short, x, WIDTH).position.max() == 0
+
+
+def test_protocol_b_starts_where_a_corner_can_touch(tosses):
+    assert protocol_starts(tosses, "A", WIDTH) is tosses
+    data = protocol_starts(tosses, "B", WIDTH)
+    height = np.sqrt(3) / 2 * WIDTH
+    started = tosses.length - data.length
+    late = started > 0  # the others begin so low
+    assert late.sum() > 50
+    assert np.all(data.x[late, 1, 0, 2] < height)
+    assert np.all(data.x[late, 0, 0, 2] >= height)
+    assert np.array_equal(data.x[0, 0], tosses.x[0, started[0]])
+    # A long flight gives better velocities than one recorded sample.
+    k = int(np.argmax(started))
+    fallen = tosses.v[k, 0, 0] - np.array([0, 0, 9.61 * DT * started[k]])
+    assert np.abs(data.v[k, 0, 0] - fallen).max() < 0.02
+    assert np.array_equal(data.group, tosses.group)
+
+
+def test_paired_differences_know_sessions():
+    rng = np.random.default_rng(0)
+    group = np.repeat(np.arange(20), 5)
+    first = rng.normal(size=100)
+    shift = np.repeat(rng.normal(size=20), 5)
+    found = paired_difference(first + 1 + shift, first, group)
+    assert np.isclose(found["mean"], 1 + shift.mean())
+    # The sessions' differences vary by 1: the mean of 20 is known to 2 / sqrt(20), however many tosses they have.
+    assert 0.5 < (found["upper"] - found["lower"]) / (2 * 1.96 * shift.std() / np.sqrt(20)) < 1.5
+    alone = paired_difference(first + 1, first, None)
+    assert np.isclose(alone["lower"], 1)
+    assert alone["sessions"] == 100
+
+
+# --- the command line ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_from_a_pose_file_to_a_table(tosses, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAROM_CACHE", "")
+    position, quaternion = poses_of(tosses.x[:30])
+    np.savez("lab.npz", position=position, quaternion=quaternion, dt=DT, group=tosses.group[:30])
+    main(["import", "poses", "lab.npz", "--mass", "0.37", "--size", str(WIDTH)])
+    assert "gravity in free flight" in capsys.readouterr().out
+    options = [
+        "--horizons",
+        "8",
+        "--segments",
+        "100",
+        "--toss-rounds",
+        "1",
+        "--evaluations",
+        "3",
+        "--toss-samples",
+        "40",
+    ]
+    main(["learn", "cube", "--data", "lab-trajectories.h5", "--out", "run", "--learn-of-toss", "friction", *options])
+    out = capsys.readouterr().out
+    assert "Protocol A" in out
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert set(report["learned"]["estimates"]) == {"friction"}
+    main(["evaluate", "run", "--protocol", "B", "--data", "lab-trajectories.h5", "--against", "run"])
+    assert "bootstrap over 2 sessions" in capsys.readouterr().out
+    rows = list(csv.DictReader((tmp_path / "run" / "toss_errors_B.csv").open()))
+    assert len(rows) == 30
+    assert {row["session"] for row in rows} == {"0", "1"}
+    for name in ("tosses.png", "toss_errors.png", "prediction.gif", "model.carom", "toss_errors_A.csv"):
+        assert (tmp_path / "run" / name).stat().st_size > 100
