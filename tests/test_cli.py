@@ -75,7 +75,7 @@ class Killed:
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learned") / "run"
-    options = [*TINY, "--out", str(folder), "--enough", "0"]  # to the last epoch
+    options = [*TINY, "--out", str(folder), "--no-refine"]  # to the last epoch
     options[options.index("--epochs") + 1] = str(EPOCHS)
     start = [sys.executable, "-m", "carom.cli.main", "learn", "throw", *options]
     environment = {

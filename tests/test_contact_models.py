@@ -334,7 +334,7 @@ def test_a_contact_model_of_ones_own(tmp_path, cp3, cp3_data):
 
 
 def test_bad_contact_models_are_refused_by_name(cp3, cp3_data):
-    message = "contact_model must be one of 'cm', 'cmr', 'lcp', or a ContactModel; it was "
+    message = "contact_model must be one of 'cm', 'cmr', 'lcp', 'speed', or a ContactModel; it was "
     x0, v0 = jnp.zeros((1, 2)), jnp.zeros((1, 2))
     with refused(message + "'cmx'"):
         carom.task("cp3", contact_model="cmx")

@@ -17,7 +17,7 @@ from carom.errors import CaromError
 from carom.simulation.files import Recording, load_recording, save_recording
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
-ARRAYS = ("x", "v", "time", "contact", "length")
+ARRAYS = ("x", "v", "time", "contact", "length", "group")
 ATTRIBUTES = ("dt", "units", "task", "source", "carom_version")
 
 
@@ -137,7 +137,7 @@ def test_suffixes(tmp_path, suffix):
 
 
 def test_a_file_has_the_documented_layout(tmp_path):
-    ragged = a_recording(contact=np.ones((4, 6), bool), length=np.array([6, 2, 3, 6]))
+    ragged = a_recording(contact=np.ones((4, 6), bool), length=np.array([6, 2, 3, 6]), group=np.array([0, 0, 1, 2]))
     save_recording(tmp_path / "a.h5", ragged)
     save_recording(tmp_path / "a.npz", ragged)
     with h5py.File(tmp_path / "a.h5") as file, np.load(tmp_path / "a.npz") as archive:
@@ -307,6 +307,11 @@ WRONG = {
         content(contact=np.zeros((4, 6))),
         "contact must hold true and false",
         "float64",
+    ),
+    "group": (
+        content(group=np.zeros(3, int)),
+        "group must be 4 integers, one a trajectory",
+        "shape (3,)",
     ),
     "contact 2": (
         content(contact=np.full((4, 6), 2)),

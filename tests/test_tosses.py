@@ -220,7 +220,6 @@ def test_paired_differences_know_sessions():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_from_a_pose_file_to_a_table(tosses, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAROM_CACHE", "")
