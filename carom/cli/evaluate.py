@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Literal
 
-import numpy as np
 from rich.console import Console
 
 from carom.checks import require
@@ -13,7 +12,6 @@ from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import measure, nominal_width, other_run
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
-from carom.learning.protocols import box_of
 from carom.learning.run import CONFIG, MODEL, RunFolder
 from carom.simulation.files import load_recording
 from carom.system import System
@@ -76,8 +74,7 @@ class Evaluate:
     def _evaluate_tosses(self, run: RunFolder, skeleton: System) -> None:
         console, system = Console(), load_model_into(run.path / MODEL, skeleton)
         test = load_recording(self.data or run.path / TEST_DATA, task=skeleton.name)
-        width = nominal_width(skeleton, 2 * float(np.min(box_of(skeleton).half_widths)))
         other = None if self.against is None else other_run(self.against, skeleton)
-        measures = measure(console, run, system, test, self.protocol, width, other)
+        measures = measure(console, run, system, test, self.protocol, nominal_width(skeleton), other)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

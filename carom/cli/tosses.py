@@ -39,15 +39,14 @@ def learn_and_measure(
     system, report = learn_tosses(skeleton, train, config, run=run)
     save_model(run.path / MODEL, system)
     console.print(estimate_table(report, skeleton.name))
-    width = 2 * float(np.min(box_of(skeleton).half_widths))
-    measures = measure(console, run, system, val, "A", nominal_width(skeleton, width))
+    measures = measure(console, run, system, val, "A", nominal_width(skeleton))
     run.write_json(REPORT, {"learned": dataclasses.asdict(report), "evaluation": measures})
     console.print(f"Done ({report.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
 
 
-def nominal_width(skeleton: System, width: float) -> float:
+def nominal_width(skeleton: System) -> float:
     """The width that errors are given in: the cube's nominal one, whatever its recordings say."""
-    return 0.1048 if skeleton.name == "cube" else width
+    return 0.1048 if skeleton.name == "cube" else 2 * float(np.min(box_of(skeleton).half_widths))
 
 
 def estimate_table(report: TossReport, name: str) -> Table:

@@ -26,7 +26,7 @@ from carom.contact.boxes import CornerPlane
 from carom.contact.impulses import SpeedCM
 from carom.learning.dataset import closed_contacts
 from carom.learning.progress import LoopProgress
-from carom.learning.protocols import pose_errors
+from carom.learning.protocols import box_of, pose_errors
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.run import RunFolder
 from carom.mechanics.bodies import RigidBody
@@ -72,10 +72,6 @@ def _leaf(where: Callable[[System], Any], scale: float, unit: str, lower=0.0, up
     return Parameter(lambda system: where(system).reshape(-1)[0], write, lower, upper, scale, unit)
 
 
-def _plane(system: System) -> CornerPlane:
-    return next(contact for contact in system.contacts if isinstance(contact, CornerPlane))
-
-
 def _acceleration(system: Any) -> Any:
     return system.potential.acceleration
 
@@ -101,16 +97,16 @@ def _speed(system: Any) -> Any:
 
 def _tilt(axis: int) -> Parameter:
     def write(system, value):
-        normal = _plane(system).normal
+        normal = box_of(system).normal
         tilted = normal.at[axis].set(value * normal[2])
-        return eqx.tree_at(lambda s: _plane(s).normal, system, tilted / jnp.linalg.norm(tilted))
+        return eqx.tree_at(lambda s: box_of(s).normal, system, tilted / jnp.linalg.norm(tilted))
 
-    return Parameter(lambda s: _plane(s).normal[axis] / _plane(s).normal[2], write, -0.1, 0.1, 0.005, "rad")
+    return Parameter(lambda s: box_of(s).normal[axis] / box_of(s).normal[2], write, -0.1, 0.1, 0.005, "rad")
 
 
 PARAMETERS: dict[str, Parameter] = {
-    "half_width": _leaf(lambda s: _plane(s).half_widths, 5e-4, "m", 1e-6),
-    "corner_radius": _leaf(lambda s: _plane(s).corner_radius, 2e-3, "m"),
+    "half_width": _leaf(lambda s: box_of(s).half_widths, 5e-4, "m", 1e-6),
+    "corner_radius": _leaf(lambda s: box_of(s).corner_radius, 2e-3, "m"),
     "inertia": Parameter(lambda s: jnp.sum(_moments(s)) * 2 / 3, _inertia, 1e-9, np.inf, 6e-5, "kg m^2"),
     "gravity": Parameter(lambda s: jnp.linalg.norm(_acceleration(s)), _gravity, 0.0, np.inf, 0.1, "m/s^2"),
     "friction": _leaf(lambda s: s.friction, 0.03, ""),
@@ -118,8 +114,8 @@ PARAMETERS: dict[str, Parameter] = {
     "restitution_decay": _leaf(lambda s: _speed(s).restitution_decay, 0.5, "s/m", -2.0, 10.0),
     "friction_decay": _leaf(lambda s: _speed(s).friction_decay, 0.2, "s/m", -2.0, 10.0),
     "table_height": Parameter(
-        lambda s: _plane(s).point[2],
-        lambda s, value: eqx.tree_at(lambda s: _plane(s).point, s, _plane(s).point.at[2].set(value)),
+        lambda s: box_of(s).point[2],
+        lambda s, value: eqx.tree_at(lambda s: box_of(s).point, s, box_of(s).point.at[2].set(value)),
         -0.1,
         0.1,
         5e-4,
@@ -291,7 +287,7 @@ def _stage(system: System, names, values, recording: Recording, horizon: int, co
     k, s = steps.T
     x0, v0 = jnp.asarray(recording.x[k, s]), jnp.asarray(recording.v[k, s])
     end = jnp.asarray(recording.x[k[:, None], s[:, None] + 1 + np.arange(horizon)])
-    size = float(jnp.min(_plane(system).half_widths))
+    size = float(jnp.min(box_of(system).half_widths))
     # The axes' ends move by as much as the body's surface does.
     reach = np.concatenate([[1.0], np.full(3, size)])[:, None]
     scale = np.array([PARAMETERS[name].scale for name in names])
@@ -393,7 +389,7 @@ def _whole(system: System, names, values, recording: Recording, config: TossConf
     x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
     x = np.asarray(_tosses(system, names, jnp.asarray(values), x0, v0, stepper, samples, config.substeps))
     position, rotation = pose_errors(x, recording.x[:, : samples + 1], np.minimum(recording.length, samples + 1))
-    return position / (2 * float(jnp.min(_plane(system).half_widths))), rotation
+    return position / (2 * float(jnp.min(box_of(system).half_widths))), rotation
 
 
 def _search(system, names, values, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
