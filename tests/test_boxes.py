@@ -15,24 +15,24 @@ HALF = (0.1, 0.2, 0.15)
 TABLE = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def box(half_widths=HALF, *, radius=0.0, friction=0.0, restitution=0.0, gravity=0.0):
+def box(half_widths=HALF, *, radius=0.0, center=None, friction=0.0, restitution=0.0, gravity=0.0):
     return carom.System(
         bodies=[carom.RigidBody(2.0, (0.02, 0.01, 0.03))],
-        contacts=[carom.CornerPlane([0], half_widths, *TABLE, corner_radius=radius)],
+        contacts=[carom.CornerPlane([0], half_widths, *TABLE, corner_radius=radius, center=center)],
         potential=carom.Gravity((0.0, 0.0, -gravity)),
         friction=friction,
         restitution=restitution,
     )
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.03])
-def test_gaps_and_velocities_of_corners(radius):
+@pytest.mark.parametrize(("radius", "center"), [(0.0, (0, 0, 0)), (0.03, (0, 0, 0)), (0.03, (0.02, -0.01, 0.05))])
+def test_gaps_and_velocities_of_corners(radius, center):
     rotation = turn(0, jnp.asarray(0.4)) @ turn(1, jnp.asarray(-0.8)) @ turn(2, jnp.asarray(0.3))
     position, velocity, omega = (jnp.array(a) for a in ([0.3, -0.1, 0.5], [1.0, -2.0, 0.5], [3.0, -1.0, 2.0]))
     x, v = embed_pose(position, rotation), embed_velocity(rotation, velocity, omega)
-    found = box(radius=radius).candidates(x)
+    found = box(radius=radius, center=center).candidates(x)
     signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
-    corner = signs * (np.array(HALF) - radius) @ np.asarray(rotation).T
+    corner = (signs * (np.array(HALF) - radius) + np.array(center)) @ np.asarray(rotation).T
     assert np.allclose(found.gap, position[2] + corner[:, 2] - radius, atol=1e-14)
     touching = corner - radius * np.array([0, 0, 1.0])
     expected = velocity + np.cross(omega, touching)
@@ -77,6 +77,22 @@ def test_a_box_that_slides_stops_after_the_way_that_friction_allows():
 
 
 @pytest.mark.slow
+def test_a_box_with_its_mass_at_the_side_tips_over_an_edge():
+    """On a plane that is tilted to the side of its mass, a box tips where its mass is beyond the edge, or rests."""
+    rests, tips = (
+        carom.simulate(
+            box((0.1, 0.1, 0.1), center=(-side, 0.0, 0.0), friction=1.0, gravity=9.81),
+            *upright(0.1, [0.0, 0.0, 0.0]),
+            dt=0.005,
+            steps=60,
+        )
+        for side in (0.09, 0.11)
+    )
+    assert np.abs(rests.x[-1, 1, 2] - rests.x[-1, 0, 2]) < 0.02
+    assert tips.x[-1, 1, 2] - tips.x[-1, 0, 2] < -0.1
+
+
+@pytest.mark.slow
 def test_a_tossed_cube_comes_to_rest_on_a_face():
     system = carom.task("cube")
     x, v = carom.sample(system, jax.random.key(0), 32)
@@ -94,6 +110,8 @@ def test_what_cannot_be_is_refused():
         carom.CornerPlane([0], (0.1, 0.2), *TABLE)
     with refused("half_widths"):
         carom.CornerPlane([0], -0.1, *TABLE)
+    with refused("CornerPlane center must be 3 coordinates; its shape was (2,)"):
+        carom.CornerPlane([0], 0.1, *TABLE, center=(0.0, 0.1))
     with refused("corner_radius"):
         carom.CornerPlane([0], 0.1, *TABLE, corner_radius=0.2)
     balls = carom.System(bodies=[carom.PointMass(1.0, 0.1)], contacts=[carom.CornerPlane([0], 0.1, *TABLE)])

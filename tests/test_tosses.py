@@ -13,9 +13,10 @@ from systems import ball_on_floor, refused
 
 import carom
 from carom.cli.main import main
-from carom.learning.protocols import paired_difference, protocol_starts, toss_errors
+from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
 from carom.learning.tosses import (
+    CENTER,
     TossConfig,
     choose_segments,
     learn_tosses,
@@ -24,6 +25,7 @@ from carom.learning.tosses import (
     read_values,
     with_values,
 )
+from carom.mechanics.bodies import embed_pose, embed_velocity
 from carom.simulation.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
@@ -113,9 +115,10 @@ def test_segments_start_in_flight_before_an_impact(cube, tosses):
 
 def test_values_are_read_as_they_were_written(cube):
     system = prepared(cube, TossConfig(learn_of_toss=("restitution_decay", "table_tilt_x", "table_height", "gravity")))
-    names = ("restitution_decay", "friction_decay", "table_tilt_x", "table_tilt_y", "table_height", "gravity")
-    values = np.array([0.3, -0.1, 0.01, -0.02, 1e-3, 9.7])
+    names = ("restitution_decay", "friction_decay", "table_tilt_x", "table_tilt_y", "table_height", "gravity", *CENTER)
+    values = np.array([0.3, -0.1, 0.01, -0.02, 1e-3, 9.7, 1e-3, -2e-3, 6e-3])
     changed = with_values(system, names, jnp.asarray(values))
+    assert np.allclose(changed.contacts[0].center, -values[-3:])
     assert np.allclose(read_values(changed, names), values, rtol=1e-12)
     assert np.isclose(jnp.linalg.norm(changed.contacts[0].normal), 1)
     assert np.allclose(read_values(changed, ("half_width", "inertia")), read_values(cube, ("half_width", "inertia")))
@@ -176,6 +179,20 @@ def test_errors_are_what_was_done_to_the_truth(cube, tosses):
     sunk = toss_errors(system, tosses, x, WIDTH)
     assert np.all(sunk.penetration > 100 * 0.6 / WIDTH)
     assert set(sunk.summary()["rotation"]) == {"mean", "sd", "median"}
+
+
+def test_recordings_are_of_the_centre_of_the_box(cube):
+    center = np.array([1e-3, -2e-3, 5e-3])
+    system = with_values(cube, CENTER, -jnp.asarray(center))
+    rotation = jnp.asarray(Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix())
+    mass, spin = jnp.array([0.1, 0.2, 0.3]), jnp.array([1.0, -2.0, 3.0])
+    x, v = embed_pose(mass, rotation), embed_velocity(rotation, jnp.array([0.5, 0.0, -1.0]), spin)
+    recorded, moving = box_points(system, x), box_points(system, v)
+    assert np.allclose(recorded[0], mass + rotation @ center)
+    assert np.allclose(moving[0], np.array([0.5, 0.0, -1.0]) + np.cross(spin, rotation @ center))
+    assert np.allclose(recorded[1:] - recorded[:1], x[1:] - x[:1])
+    assert np.allclose(body_points(system, recorded), x)
+    assert np.allclose(body_points(system, moving), v)
 
 
 def test_a_toss_counts_to_its_own_end(cube, tosses):

@@ -17,6 +17,7 @@ from carom.learning.model_file import load_model_into, save_model
 from carom.learning.protocols import (
     Protocol,
     TossErrors,
+    body_points,
     box_of,
     paired_difference,
     protocol_starts,
@@ -25,7 +26,6 @@ from carom.learning.protocols import (
 from carom.learning.run import MODEL, REPORT, RunFolder
 from carom.learning.tosses import TossConfig, TossReport, learn_tosses, predict_tosses
 from carom.simulation.files import Recording
-from carom.simulation.rollout import Trajectory
 from carom.system import System
 
 PUBLISHED = {"friction": 0.18, "restitution": 0.125}
@@ -126,7 +126,8 @@ def _pictures(run: RunFolder, system, data: Recording, predicted, errors: TossEr
     k = tosses.chosen_tosses(errors)["median"]
     true = trajectory_of(data, k)
     count = len(true.time)
-    guess = Trajectory(jnp.asarray(predicted[k, :count]), true.v, true.contact, true.time, true.overflow, true.residual)
+    shown_as = (body_points(system, points) for points in (true.x, jnp.asarray(predicted[k, :count])))
+    true, guess = (dataclasses.replace(true, x=points) for points in shown_as)
     animate.animate(system, true, guess, run.path / "prediction.gif")
 
 

@@ -16,8 +16,8 @@ from carom.contact.geometry import sphere_plane
 class CornerPlane(Contact):
     """Contacts between the corners of boxes (rectangles in 2D) and a fixed plane: a tossed cube and a table.
 
-    A box's centre is its body's centre of mass, and its edges are along the body's axes. Corners may be rounded: they
-    are then spheres that touch the faces from within, so the box is as wide as without.
+    A box's edges are along its body's axes. Corners may be rounded: they are then spheres that touch the faces from
+    within, so the box is as wide as without.
 
     **Arguments:**
 
@@ -25,9 +25,10 @@ class CornerPlane(Contact):
     - `half_widths` (d,), or one number for a cube (m): half of the edges' lengths.
     - `point` (d,), on the plane (m); `normal` (d,), out of the solid side, of any length.
     - `corner_radius` (m), at most the least half width; 0: sharp corners.
+    - `center` (d,), of the box, from its body's centre of mass along the body's axes (m); zero for a homogeneous box.
     - `property`, index into the system's `friction` and `restitution`: one for all, or one for each body.
 
-    Widths and radius are arrays of the system: derivatives by them are right, so that they can be learned.
+    Widths, radius and centre are arrays of the system: derivatives by them are right, so that they can be learned.
 
     **Raises:** `CaromError` for lengths that are not positive, or a radius larger than a half width.
     """
@@ -35,6 +36,7 @@ class CornerPlane(Contact):
     bodies: tuple[int, ...] = eqx.field(static=True)
     half_widths: Float[Array, " d"]
     corner_radius: Float[Array, ""]
+    center: Float[Array, " d"]
     point: Float[Array, " d"]
     normal: Float[Array, " d"]
     property_index: tuple[int, ...] = eqx.field(static=True)
@@ -47,6 +49,7 @@ class CornerPlane(Contact):
         normal,
         corner_radius: ArrayLike = 0.0,
         property: int | Sequence[int] = 0,
+        center=None,
     ):
         self.bodies = tuple(int(b) for b in bodies)
         self.point, self.normal = plane("CornerPlane", point, normal)
@@ -64,6 +67,12 @@ class CornerPlane(Contact):
         require_values("half_widths", half_widths, self.half_widths > 0, "positive lengths in m")
         inside = (self.corner_radius >= 0) & (self.corner_radius <= jnp.min(self.half_widths))
         require_values("corner_radius", corner_radius, inside, "from zero to the least half width (m)")
+        self.center = jnp.zeros(dim) if center is None else as_floats(center)
+        require(
+            self.center.shape == (dim,),
+            f"CornerPlane center must be {dim} coordinates; its shape was {self.center.shape}.",
+        )
+        require_values("center", center, jnp.isfinite(self.center), "finite coordinates in m")
         each = property_indices("CornerPlane", property, len(self.bodies))
         self.property_index = tuple(p for p in each for _ in range(2**dim))
 
@@ -82,7 +91,7 @@ class CornerPlane(Contact):
             stencil.shape[1] == x.shape[1] + 1,
             f"CornerPlane is for rigid bodies; the bodies {sorted(set(self.bodies))} cannot turn.",
         )
-        local = self._corners().astype(x.dtype) * (self.half_widths - self.corner_radius)
+        local = self.center + self._corners().astype(x.dtype) * (self.half_widths - self.corner_radius)
         center = x[stencil[:, 0]]
         corner = center + jnp.einsum("ca,cad->cd", local, x[stencil[:, 1:]] - center[:, None])
         radius = jnp.broadcast_to(self.corner_radius, body.shape)
@@ -97,7 +106,7 @@ class CornerPlane(Contact):
 
     def travel(self, radii):
         # Corners turn about the centre: half a radian.
-        return jnp.full(len(self._body()), 0.5 * jnp.linalg.norm(self.half_widths), radii.dtype)
+        return jnp.full(len(self._body()), 0.5 * jnp.linalg.norm(self.half_widths + jnp.abs(self.center)), radii.dtype)
 
     def bodies_of(self):
         return tuple((int(b),) for b in self._body())

@@ -3,9 +3,10 @@
 import dataclasses
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from carom.checks import require
 from carom.contact.boxes import CornerPlane
@@ -83,11 +84,26 @@ def _flight_velocity(x: Float[np.ndarray, "t 4 3"], recorded: Float[np.ndarray, 
     return center + np.concatenate([np.zeros((1, 3)), np.cross(omega, x[-1, 1:] - x[-1, :1])])
 
 
-def lowest_corner(system: System, x: Float[np.ndarray, "N T 4 3"]) -> Float[np.ndarray, "N T"]:
-    """Height of the lowest corner above the plane (m); negative where it penetrates."""
-    import jax
+def body_points(system: System, box: Float[Array, "... 4 3"]) -> Float[Array, "... 4 3"]:
+    """Points of the body (from its centre of mass), or their velocities, from those that start at the box's centre.
 
-    gaps = jax.jit(jax.vmap(jax.vmap(system.gaps)))(jnp.asarray(x))
+    Recordings are of the box's centre, `x_0 + R c` for a box whose `center` is at c; axes are the same for both.
+    """
+    return box - _middle(system, box)
+
+
+def box_points(system: System, body: Float[Array, "... 4 3"]) -> Float[Array, "... 4 3"]:
+    """The inverse of `body_points`."""
+    return body + _middle(system, body)
+
+
+def _middle(system: System, points):
+    return jnp.einsum("a,...ad->...d", box_of(system).center, points[..., 1:, :] - points[..., :1, :])[..., None, :]
+
+
+def lowest_corner(system: System, x: Float[np.ndarray, "N T 4 3"]) -> Float[np.ndarray, "N T"]:
+    """Height of the lowest corner above the plane (m), of recorded points; negative where it penetrates."""
+    gaps = jax.jit(jax.vmap(jax.vmap(system.gaps)))(body_points(system, jnp.asarray(x)))
     return np.asarray(jnp.min(gaps, axis=-1))
 
 

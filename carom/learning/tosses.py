@@ -26,7 +26,7 @@ from carom.contact.boxes import CornerPlane
 from carom.contact.impulses import SpeedCM
 from carom.learning.dataset import closed_contacts
 from carom.learning.progress import LoopProgress
-from carom.learning.protocols import box_of, pose_errors
+from carom.learning.protocols import body_points, box_of, box_points, pose_errors
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.run import RunFolder
 from carom.mechanics.bodies import RigidBody
@@ -40,6 +40,9 @@ Quantity = Literal[
     "half_width",
     "corner_radius",
     "inertia",
+    "center_of_mass_x",
+    "center_of_mass_y",
+    "center_of_mass_z",
     "gravity",
     "friction",
     "restitution",
@@ -49,7 +52,8 @@ Quantity = Literal[
     "table_tilt_x",
     "table_tilt_y",
 ]
-PLAIN: tuple[Quantity, ...] = ("half_width", "corner_radius", "inertia", "friction", "restitution")
+CENTER: tuple[Quantity, ...] = ("center_of_mass_x", "center_of_mass_y", "center_of_mass_z")
+PLAIN: tuple[Quantity, ...] = ("half_width", "corner_radius", "inertia", *CENTER, "friction", "restitution")
 
 
 class Parameter(NamedTuple):
@@ -95,6 +99,15 @@ def _speed(system: Any) -> Any:
     return system.contact_model
 
 
+def _center_of_mass(axis: int) -> Parameter:
+    """The centre of mass is to the box's centre as the box's centre is to it, turned round."""
+
+    def write(system, value):
+        return eqx.tree_at(lambda s: box_of(s).center, system, box_of(system).center.at[axis].set(-value))
+
+    return Parameter(lambda s: -box_of(s).center[axis], write, -1.0, 1.0, 1e-3, "m")
+
+
 def _tilt(axis: int) -> Parameter:
     def write(system, value):
         normal = box_of(system).normal
@@ -108,6 +121,7 @@ PARAMETERS: dict[str, Parameter] = {
     "half_width": _leaf(lambda s: box_of(s).half_widths, 5e-4, "m", 1e-6),
     "corner_radius": _leaf(lambda s: box_of(s).corner_radius, 2e-3, "m"),
     "inertia": Parameter(lambda s: jnp.sum(_moments(s)) * 2 / 3, _inertia, 1e-9, np.inf, 6e-5, "kg m^2"),
+    **{name: _center_of_mass(axis) for axis, name in enumerate(CENTER)},
     "gravity": Parameter(lambda s: jnp.linalg.norm(_acceleration(s)), _gravity, 0.0, np.inf, 0.1, "m/s^2"),
     "friction": _leaf(lambda s: s.friction, 0.03, ""),
     "restitution": _leaf(lambda s: s.restitution, 0.08, "", 0.0, 1.0),
@@ -228,7 +242,13 @@ def toss_stepper(dt: float, substeps: int = 1) -> Stepper:
 
 
 def _predict(system: System, x0, v0, stepper: Stepper, samples: int, substeps: int):
-    return jax.vmap(lambda x, v: rollout(system, x, v, stepper, samples * substeps).x[::substeps])(x0, v0)
+    """Recorded points at the samples, from recorded points and velocities."""
+
+    def one(x, v):
+        motion = rollout(system, body_points(system, x), body_points(system, v), stepper, samples * substeps)
+        return box_points(system, motion.x[::substeps])
+
+    return jax.vmap(one)(x0, v0)
 
 
 @eqx.filter_jit
@@ -265,7 +285,7 @@ def choose_segments(
 ) -> Int[np.ndarray, "S 2"]:
     """Starts `(toss, sample)` in flight: no impact near to its velocities, and one within half a horizon."""
     rng = np.random.default_rng((seed, horizon))
-    near = closed_contacts(recording.x - np.array([0, 0, 1e-3]), system) > 0
+    near = closed_contacts(np.asarray(body_points(system, jnp.asarray(recording.x))) - [0, 0, 1e-3], system) > 0
     starts = []
     for k, length in enumerate(recording.length):
         for s in range(length - horizon):

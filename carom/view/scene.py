@@ -65,13 +65,11 @@ def lines_of(system: System) -> Lines:
             anchors.append(np.asarray(link.anchor, float))
             offset.append([zero, anchors[-1]])
     boxes = _boxes(system)
-    for index, half in boxes.items():
+    for index, (half, middle) in boxes.items():
         center, axes = system.table.center[index], list(system.table.axes[index])
-        for first, second in _edges(dim):
-            ends = []
-            for corner in (first, second):
-                point = unit[center] * (1 - np.sum(corner * half))
-                ends.append(point + (corner * half) @ unit[axes])
+        for signs in _edges(dim):
+            corners = [middle + sign * half for sign in signs]
+            ends = [unit[center] * (1 - np.sum(corner)) + corner @ unit[axes] for corner in corners]
             weights.append(ends)
             offset.append([zero, zero])
     for index, (body, center) in enumerate(zip(system.bodies, system.table.center, strict=True)):
@@ -89,10 +87,14 @@ def lines_of(system: System) -> Lines:
     )
 
 
-def _boxes(system: System) -> dict[int, np.ndarray]:
-    """Half widths of the bodies that are boxes."""
+def _boxes(system: System) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Half widths of the bodies that are boxes, and their middles along the body's axes."""
     corners = (contact for contact in system.contacts if isinstance(contact, CornerPlane))
-    return {body: np.asarray(contact.half_widths, float) for contact in corners for body in contact.bodies}
+    return {
+        body: (np.asarray(contact.half_widths, float), np.asarray(contact.center, float))
+        for contact in corners
+        for body in contact.bodies
+    }
 
 
 def _edges(dim: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -150,8 +152,8 @@ def box_of(system: System, trajectory: Trajectory, anchors: np.ndarray) -> np.nd
     """Lower and upper corner (2, d) of all that the trajectory reaches."""
     x = positions_of(trajectory, FAR)[:, list(system.table.center)]
     radii = np.array(system.radii, float)[:, None]
-    for body, half in _boxes(system).items():
-        radii[body] = np.linalg.norm(half)
+    for body, (half, middle) in _boxes(system).items():
+        radii[body] = np.linalg.norm(half + np.abs(middle))
     reached = np.concatenate([(x - radii).reshape(-1, system.dim), (x + radii).reshape(-1, system.dim), anchors])
     reached = reached[np.isfinite(reached).all(axis=1)]
     return np.array([reached.min(axis=0), reached.max(axis=0)])

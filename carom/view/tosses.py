@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from carom.learning.protocols import TossErrors, lowest_corner
+from carom.learning.protocols import TossErrors, body_points, lowest_corner
 from carom.simulation.files import Recording
 from carom.system import System
 from carom.view.style import BLUE, DASHES, INK, VERMILLION, figure_style, new_figure, save_png
@@ -61,7 +61,8 @@ def toss_figure(
 
 
 def _energy(system: System, x: Float[np.ndarray, "T 4 3"], dt: float) -> Float[np.ndarray, " inner"]:
-    """Energy at the inner samples, above that at rest on a face."""
+    """Energy of recorded points at the inner samples, above that at rest on a face."""
+    x = np.asarray(body_points(system, jnp.asarray(x)))
     v = (x[2:] - x[:-2]) / (2 * dt)
     energy = np.asarray(jax.vmap(system.energy)(jnp.asarray(x[1:-1]), jnp.asarray(v)))
     return energy - float(energy[-1])
