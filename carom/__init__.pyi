@@ -10,8 +10,8 @@ from .contact.impulses import LCP as LCP
 from .contact.impulses import CMr as CMr
 from .contact.impulses import ContactModel as ContactModel
 from .contact.impulses import ContactState as ContactState
+from .contact.impulses import Coulomb as Coulomb
 from .contact.impulses import Jump as Jump
-from .contact.impulses import SpeedCM as SpeedCM
 from .contact.impulses import contact_impulse as contact_impulse
 from .contact.impulses import solve_impulse as solve_impulse
 from .contact.limits import BendLimit as BendLimit

@@ -1,4 +1,4 @@
-"""The contact models CM, CMr and LCP: against references and each other, derivatives, and how they are chosen."""
+"""The contact models: against references and each other, derivatives, and how they are chosen."""
 
 import dataclasses
 
@@ -121,6 +121,70 @@ def test_cmr_of_one_contact_in_closed_form():
     assert np.allclose(out.v[1, 0], [0, -left + a * rebound], atol=1e-8)
 
 
+# --- Coulomb --------------------------------------------------------------------------------------------------------
+
+
+def test_coulomb_obeys_the_law_and_cm_lifts_what_slides():
+    """Compression (e = 0): gaps close or no force, and friction of mu f_n against the sliding, within the cone."""
+    rng = np.random.default_rng(5)
+    half = rng.normal(size=(16, 9, 9))
+    A = half @ half.transpose(0, 2, 1) / 9 + 0.3 * np.eye(9)
+    v = rng.normal(size=(16, 3, 3))
+    mu = rng.uniform(0, 0.6, size=(16, 3))
+    made = generate(np.random.default_rng(0), "gaussian", 16, 3, 3)
+    state = state_of(made._replace(A=A, v=v, v_star=0 * v, friction=mu, restitution=0 * mu))
+
+    def lift(model):
+        impulse = np.asarray(impulses(model, state))
+        after = v + np.asarray(apply(A, impulse))
+        slip = np.linalg.norm(after[..., 1:], axis=-1)
+        assert np.all(np.linalg.norm(impulse[..., 1:], axis=-1) <= mu * impulse[..., 0] + 1e-7)
+        pressed = impulse[..., 0] > 1e-6
+        assert pressed.mean() > 0.3
+        power = np.sum(impulse[..., 1:] * after[..., 1:], axis=-1)
+        assert np.min(after[..., 0][~pressed]) > -1e-6
+        return np.max(np.abs(after[..., 0])[pressed]), np.max(np.abs(power + mu * impulse[..., 0] * slip))
+
+    assert lift(carom.CM())[0] > 0.1
+    (first, _), (second, _), (third, against_sliding) = (lift(carom.Coulomb(iterations=n)) for n in (1, 4, 16))
+    assert second < first / 5
+    assert third < 1e-4
+    assert against_sliding < 1e-4
+
+
+def one_contact(speed, sliding, friction, restitution):
+    """One contact in 2D, of a mass of 1 kg, that approaches and slides."""
+    v = np.array([[[-speed, sliding]]])
+    made = generate(np.random.default_rng(0), "gaussian", 1, 1, 2)
+    return state_of(
+        made._replace(
+            A=np.eye(2)[None], v=v, v_star=0 * v, friction=np.array([[friction]]), restitution=np.array([[restitution]])
+        )
+    )
+
+
+def test_one_sliding_contact_by_hand():
+    """Poisson: the impulse is (1 + e) u_n, and friction mu of it; CM's is larger by what it lifts."""
+    state = one_contact(1.0, 2.0, 0.3, 0.5)
+    assert np.allclose(impulses(carom.Coulomb(), state)[0, 0], [1.5, -0.45], atol=1e-3)
+    assert np.allclose(impulses(carom.Coulomb(iterations=12), state)[0, 0], [1.5, -0.45], atol=1e-8)
+    assert impulses(carom.CM(), state)[0, 0, 0] > 1.8
+
+
+def test_fast_impacts_bounce_less_and_fast_sliding_has_less_friction():
+    e, mu, speed, along, decay, fade = 0.8, 0.3, 2.0, 3.0, 0.4, 0.2
+
+    def jump(decay, fade):
+        return impulses(carom.Coulomb(decay, fade, iterations=12), one_contact(speed, along, mu, e))[0, 0]
+
+    normal = speed * (1 + e * np.exp(-decay * speed))
+    assert np.allclose(jump(decay, fade), [normal, -mu * np.exp(-fade * along) * normal], atol=1e-8)
+    slope = jax.grad(lambda k: jump(k, fade)[0])(decay)
+    assert np.isclose(slope, -speed * speed * e * np.exp(-decay * speed), rtol=1e-5)
+    slope = jax.grad(lambda k: jump(decay, k)[1])(fade)
+    assert np.isclose(slope, mu * along * np.exp(-fade * along) * normal, rtol=1e-5)
+
+
 # --- LCP ----------------------------------------------------------------------------------------------------------
 
 
@@ -198,7 +262,7 @@ def before_contact(dataset):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", [pytest.param("lcp", marks=pytest.mark.ci_budget), "cmr"])
+@pytest.mark.parametrize("model", [pytest.param("lcp", marks=pytest.mark.ci_budget), "cmr", "coulomb"])
 def test_derivatives_through_a_step_of_cp3(model, cp3, cp3_data):
     """By all that states and systems consist of, against differences, for many impacts at once."""
     system = eqx.tree_at(lambda s: s.restitution, cp3.with_contact_model(model), jnp.array([0.4]))
@@ -302,7 +366,7 @@ def test_simulate_takes_another_contact_model_than_the_systems():
 
 def test_a_saved_model_has_its_contact_model_again(tmp_path, cp3):
     path = tmp_path / "model.carom"
-    for model in (carom.CM(), carom.CMr(0.25), carom.LCP(8)):
+    for model in (carom.CM(), carom.CMr(0.25), carom.Coulomb(0.1, 0.2, 5), carom.LCP(8)):
         carom.save_model(path, cp3.with_contact_model(model))
         again = carom.load_model(path).contact_model
         assert eqx.tree_equal(again, model)
@@ -334,7 +398,7 @@ def test_a_contact_model_of_ones_own(tmp_path, cp3, cp3_data):
 
 
 def test_bad_contact_models_are_refused_by_name(cp3, cp3_data):
-    message = "contact_model must be one of 'cm', 'cmr', 'lcp', 'speed', or a ContactModel; it was "
+    message = "contact_model must be one of 'cm', 'cmr', 'lcp', 'coulomb', or a ContactModel; it was "
     x0, v0 = jnp.zeros((1, 2)), jnp.zeros((1, 2))
     with refused(message + "'cmx'"):
         carom.task("cp3", contact_model="cmx")
@@ -360,6 +424,10 @@ def test_bad_contact_models_are_refused_by_name(cp3, cp3_data):
         learn(cp3.with_contact_model(carom.CMr(0.0)), cp3_data, dataclasses.replace(TINY, epsilon="learn"))
     with refused("facets must be even and at least 4; it was 5"):
         carom.LCP(5)
+    with refused("iterations must be at least 1; it was 0"):
+        carom.Coulomb(iterations=0)
+    with refused("friction_decay must be one number; its shape was (2,)"):
+        carom.Coulomb(friction_decay=[0.1, 0.2])
     with refused("smoothing must be 0 with the contact model LCP"):
         simulate(ball_on_floor(), x0 + 0.2, v0, dt=0.01, steps=1, contact_model="lcp", smoothing=0.1)
 

@@ -134,33 +134,6 @@ def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
         learn_tosses(cube, short, CONFIG, progress=False)
 
 
-# --- restitution and friction that depend on speed ----------------------------------------------------------------
-
-
-@pytest.mark.parametrize("decay", [0.0, 0.4])
-def test_fast_impacts_bounce_less(decay):
-    e, speed = 0.8, 2.0
-    ball = ball_on_floor(restitution=e, gravity=0.0).with_contact_model(carom.SpeedCM(decay))
-    x0, v0 = jnp.array([[0.0, 0.105]]), jnp.array([[0.0, -speed]])
-    motion = carom.simulate(ball, x0, v0, dt=0.01, steps=4, impact="event")
-    assert np.isclose(motion.v[-1, 0, 1], speed * e * np.exp(-decay * speed), atol=1e-9)
-    slope = jax.grad(
-        lambda k: carom.simulate(ball.with_contact_model(carom.SpeedCM(k)), x0, v0, dt=0.01, steps=4, impact="event").v[
-            -1, 0, 1
-        ]
-    )(decay)
-    assert np.isclose(slope, -speed * speed * e * np.exp(-decay * speed), rtol=1e-6)
-
-
-def test_fast_sliding_has_less_friction():
-    mu, along, down, decay = 0.3, 3.0, 1.0, 0.2
-    ball = ball_on_floor(friction=mu, gravity=0.0).with_contact_model(carom.SpeedCM(0.0, decay))
-    x0, v0 = jnp.array([[0.0, 0.105]]), jnp.array([[along, -down]])
-    motion = carom.simulate(ball, x0, v0, dt=0.01, steps=2, impact="event", compensation_steps=None)
-    impulse = np.asarray(motion.v[-1, 0]) - [along, -down]  # of a mass of 1 kg
-    assert np.isclose(-impulse[0] / impulse[1], mu * np.exp(-decay * along), atol=1e-9)
-
-
 # --- protocols ----------------------------------------------------------------------------------------------------
 
 

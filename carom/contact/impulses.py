@@ -84,36 +84,46 @@ class CMr(ContactModel):
         return _two_phase_jump(state, smoothing, jnp.where(present, self.epsilon.astype(state.delassus.dtype), 0))
 
 
-class SpeedCM(ContactModel):
-    """CM with a restitution that depends on the speed of approach, and a friction that depends on that of sliding:
+class Coulomb(ContactModel):
+    """Coulomb's friction with Poisson's restitution: CM without the lift of contacts that slide.
+
+    The convex programs of CM make a contact that slides with `v_t` separate with `v_n = mu |v_t|` (they ask for
+    velocities in the dual cone), as if it bounced. With `mu |v_t|` of the solution added to the normal velocity that a
+    program starts from, its solution is that of Coulomb's law with `v_n >= 0` (G. De Saxce, Z.-Q. Feng 1998; V. Acary,
+    F. Cadoux, C. Lemarechal, J. Malick 2011). `iterations` programs are solved in turn for it, from the sliding before:
+    the error shrinks by a factor of about the friction squared in each.
+
+    Friction and restitution can depend on speed, with the contact's velocities (m/s) before the impact:
 
         e(v_n) = e exp(-restitution_decay |v_n|),   mu(v_t) = mu exp(-friction_decay |v_t|)
 
-    with the contact's velocities (m/s) before the impact; e is kept to at most 1. Real bodies bounce less from faster
-    impacts (W. Goldsmith, *Impact*, 1960), which is a positive `restitution_decay`. Both zero: CM.
+    and e kept to at most 1. Real bodies bounce less from faster impacts (W. Goldsmith, *Impact*, 1960), which is a
+    positive `restitution_decay`.
 
-    **Arguments:** `restitution_decay`, `friction_decay` in s/m. They are leaves of the pytree and can be learned.
+    **Arguments:** `restitution_decay`, `friction_decay` in s/m: leaves of the pytree, which can be learned;
+    `iterations`.
 
-    **Raises:** `CaromError` for values that are not one number.
+    **Raises:** `CaromError` for decays that are not one number, and for less than one iteration.
     """
 
     restitution_decay: Float[Array, ""]
     friction_decay: Float[Array, ""]
+    iterations: int = eqx.field(static=True)
 
-    def __init__(self, restitution_decay: ArrayLike = 0.0, friction_decay: ArrayLike = 0.0):
+    def __init__(self, restitution_decay: ArrayLike = 0.0, friction_decay: ArrayLike = 0.0, iterations: int = 3):
         self.restitution_decay, self.friction_decay = as_floats(restitution_decay), as_floats(friction_decay)
         for name in ("restitution_decay", "friction_decay"):
             shape = getattr(self, name).shape
             require(shape == (), f"{name} must be one number; its shape was {shape}.")
+        require(iterations >= 1, f"iterations must be at least 1; it was {iterations}.")
+        self.iterations = iterations
 
     def __call__(self, state, *, smoothing=0.0):
         approach = jnp.maximum(-state.velocity[:, 0], 0)
-        square = jnp.sum(state.velocity[:, 1:] ** 2, axis=1)
-        sliding = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)  # its derivative at rest is 0
         restitution = jnp.minimum(state.restitution * jnp.exp(-self.restitution_decay * approach), 1)
-        friction = state.friction * jnp.exp(-self.friction_decay * sliding)
-        changed = eqx.tree_at(lambda s: (s.restitution, s.friction), state, (restitution, friction))
-        return _two_phase_jump(changed, smoothing)
+        friction = state.friction * jnp.exp(-self.friction_decay * _length(state.velocity[:, 1:]))
+        at_speed = state._replace(restitution=restitution, friction=friction)
+        return _two_phase_jump(at_speed, smoothing, sliding=self.iterations)
 
 
 class LCP(ContactModel):
@@ -147,7 +157,7 @@ class LCP(ContactModel):
         return Jump(_velocity_jump(state, solution.impulse), solution.residual, solution.impulse[None])
 
 
-CONTACT_MODELS: dict[str, type[ContactModel]] = {"cm": CM, "cmr": CMr, "lcp": LCP, "speed": SpeedCM}
+CONTACT_MODELS: dict[str, type[ContactModel]] = {"cm": CM, "cmr": CMr, "lcp": LCP, "coulomb": Coulomb}
 """Contact models by the names under which they are chosen and saved."""
 
 
@@ -176,7 +186,15 @@ def contact_model_settings(model: ContactModel) -> dict[str, Any]:
     return {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.metadata.get("static", False)}
 
 
-def _two_phase_jump(state: ContactState, smoothing: float, diagonal: Float[Array, " r"] | None = None) -> Jump:
+def _length(vector: Float[Array, "*b d"]) -> Float[Array, "*b"]:
+    """Length, with a derivative of zero at zero."""
+    square = jnp.sum(vector**2, axis=-1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def _two_phase_jump(
+    state: ContactState, smoothing: float, diagonal: Float[Array, " r"] | None = None, sliding: int = 0
+) -> Jump:
     compression, rebound = two_phases(
         state.delassus,
         state.velocity,
@@ -185,6 +203,7 @@ def _two_phase_jump(state: ContactState, smoothing: float, diagonal: Float[Array
         state.target,
         diagonal=diagonal,
         smoothing=smoothing,
+        sliding=sliding,
     )
     residual = jnp.maximum(compression.residual, rebound.residual)
     velocity = _velocity_jump(state, compression.impulse + rebound.impulse)
@@ -253,11 +272,12 @@ def contact_impulse(
 
 
 def two_phases(
-    A, v, friction, restitution, v_star, *, diagonal: Array | None = None, smoothing: float = 0.0
+    A, v, friction, restitution, v_star, *, diagonal: Array | None = None, smoothing: float = 0.0, sliding: int = 0
 ) -> tuple[ConeSolution, ConeSolution]:
     """`contact_impulse` without its checks, with the solver's residuals.
 
     `diagonal` (..., K d) is added to that of A in the convex programs alone, not where velocities are computed.
+    `sliding` programs in each phase undo the lift of contacts that slide (see `Coulomb`); 0: CM, which has it.
     """
     program = A if diagonal is None else A + diagonal[..., None] * jnp.eye(A.shape[-1], dtype=A.dtype)
 
@@ -265,8 +285,22 @@ def two_phases(
     def phase(state, is_rebound):
         velocity, lower = state
         velocity = velocity - jnp.where(is_rebound, v_star, 0)
-        solution = _solve(program, velocity, friction, jnp.where(is_rebound, lower, -jnp.inf), smoothing, reference=v)
-        change = (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
+        least = jnp.where(is_rebound, lower, -jnp.inf)
+
+        def solved(start):
+            solution = _solve(program, start, friction, least, smoothing, reference=v)
+            return solution, (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
+
+        def lifted(change):
+            return velocity.at[..., 0].add(friction * _length((velocity + change)[..., 1:]))
+
+        if sliding:
+            change, solutions = jax.lax.scan(
+                lambda change, _: solved(lifted(change))[::-1], jnp.zeros_like(v), length=sliding
+            )
+            solution = jax.tree.map(lambda s: s[-1], solutions)
+        else:
+            solution, change = solved(velocity)
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
         return (velocity + change, lower), solution
 
