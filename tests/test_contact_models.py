@@ -171,18 +171,20 @@ def test_one_sliding_contact_by_hand():
     assert impulses(carom.CM(), state)[0, 0, 0] > 1.8
 
 
-def test_fast_impacts_bounce_less_and_fast_sliding_has_less_friction():
-    e, mu, speed, along, decay, fade = 0.8, 0.3, 2.0, 3.0, 0.4, 0.2
+def test_fast_impacts_have_less_friction_and_restitution():
+    e, mu, speed, losses, pace = 0.8, 0.3, 0.4, (0.3, 0.5), 0.25
+    lost = 1 - np.exp(-speed / pace)
 
-    def jump(decay, fade):
-        return impulses(carom.Coulomb(decay, fade, iterations=12), one_contact(speed, along, mu, e))[0, 0]
+    def jump(friction_loss, restitution_loss):
+        model = carom.Coulomb(friction_loss, restitution_loss, pace, iterations=12)
+        return impulses(model, one_contact(speed, 3.0, mu, e))[0, 0]
 
-    normal = speed * (1 + e * np.exp(-decay * speed))
-    assert np.allclose(jump(decay, fade), [normal, -mu * np.exp(-fade * along) * normal], atol=1e-8)
-    slope = jax.grad(lambda k: jump(k, fade)[0])(decay)
-    assert np.isclose(slope, -speed * speed * e * np.exp(-decay * speed), rtol=1e-5)
-    slope = jax.grad(lambda k: jump(decay, k)[1])(fade)
-    assert np.isclose(slope, mu * along * np.exp(-fade * along) * normal, rtol=1e-5)
+    normal = speed * (1 + e * (1 - losses[1] * lost))
+    friction = mu * (1 - losses[0] * lost)
+    assert np.allclose(jump(*losses), [normal, -friction * normal], atol=1e-8)
+    slopes = jax.jacobian(lambda losses: jump(*losses))(jnp.asarray(losses))
+    expected = [[0, -speed * e * lost], [mu * lost * normal, friction * speed * e * lost]]
+    assert np.allclose(slopes, expected, rtol=1e-5, atol=1e-6)
 
 
 # --- LCP ----------------------------------------------------------------------------------------------------------
@@ -366,7 +368,7 @@ def test_simulate_takes_another_contact_model_than_the_systems():
 
 def test_a_saved_model_has_its_contact_model_again(tmp_path, cp3):
     path = tmp_path / "model.carom"
-    for model in (carom.CM(), carom.CMr(0.25), carom.Coulomb(0.1, 0.2, 5), carom.LCP(8)):
+    for model in (carom.CM(), carom.CMr(0.25), carom.Coulomb(0.1, 0.2, 0.5, 4), carom.LCP(8)):
         carom.save_model(path, cp3.with_contact_model(model))
         again = carom.load_model(path).contact_model
         assert eqx.tree_equal(again, model)
@@ -426,8 +428,12 @@ def test_bad_contact_models_are_refused_by_name(cp3, cp3_data):
         carom.LCP(5)
     with refused("iterations must be at least 1; it was 0"):
         carom.Coulomb(iterations=0)
-    with refused("friction_decay must be one number; its shape was (2,)"):
-        carom.Coulomb(friction_decay=[0.1, 0.2])
+    with refused("friction_loss must be one number; its shape was (2,)"):
+        carom.Coulomb([0.1, 0.2])
+    with refused("restitution_loss must be a share from 0 to 1; it was 1.5"):
+        carom.Coulomb(restitution_loss=1.5)
+    with refused("loss_speed must be a positive speed in m/s; it was 0"):
+        carom.Coulomb(loss_speed=0.0)
     with refused("smoothing must be 0 with the contact model LCP"):
         simulate(ball_on_floor(), x0 + 0.2, v0, dt=0.01, steps=1, contact_model="lcp", smoothing=0.1)
 

@@ -30,7 +30,15 @@ from carom.simulation.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
 NAMES = ("inertia", "friction", "restitution")
-CONFIG = TossConfig(learn_of_toss=NAMES, horizons=(8,), segments=200, toss_rounds=4, evaluations=0, toss_samples=50)
+CONFIG = TossConfig(
+    learn_of_toss=NAMES,
+    horizons=(8,),
+    segments=200,
+    toss_rounds=4,
+    evaluations=0,
+    toss_samples=50,
+    toss_contact_model=None,
+)
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +122,9 @@ def test_segments_start_in_flight_before_an_impact(cube, tosses):
 
 
 def test_values_are_read_as_they_were_written(cube):
-    system = prepared(cube, TossConfig(learn_of_toss=("restitution_decay", "table_tilt_x", "table_height", "gravity")))
-    names = ("restitution_decay", "friction_decay", "table_tilt_x", "table_tilt_y", "table_height", "gravity", *CENTER)
-    values = np.array([0.3, -0.1, 0.01, -0.02, 1e-3, 9.7, 1e-3, -2e-3, 6e-3])
+    system = prepared(cube, TossConfig(learn_of_toss=("restitution_loss", "table_tilt_x", "table_height", "gravity")))
+    names = ("restitution_loss", "friction_loss", "table_tilt_x", "table_tilt_y", "table_height", "gravity", *CENTER)
+    values = np.array([0.3, 0.1, 0.01, -0.02, 1e-3, 9.7, 1e-3, -2e-3, 6e-3])
     changed = with_values(system, names, jnp.asarray(values))
     assert np.allclose(changed.contacts[0].center, -values[-3:])
     assert np.allclose(read_values(changed, names), values, rtol=1e-12)

@@ -1,4 +1,4 @@
-"""`carom import poses FILE`: a recording of poses as a trajectory file."""
+"""`carom import`: a recording of poses as a trajectory file, and the public recordings as poses."""
 
 import dataclasses
 from pathlib import Path
@@ -13,7 +13,7 @@ from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.arguments import FilePath
 
-Kind = Annotated[Literal["poses"], tyro.conf.Positional, tyro.conf.arg(metavar="poses")]
+Kind = Annotated[Literal["poses", "contactnets"], tyro.conf.Positional, tyro.conf.arg(metavar="poses|contactnets")]
 Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
 
 
@@ -22,18 +22,22 @@ class Import:
     """Turn recorded poses of a tossed body (positions and quaternions, NPZ or HDF5) into a carom trajectory file.
 
     Says what looks wrong: scale, gravity, penetration, bias, copies, late velocities. docs/real-data.md has the format.
+    `carom import contactnets FILE.tar.gz` turns the public recordings of a tossed cube into a pose file; the archive is
+    downloaded if it is not there.
     """
 
     kind: Kind
     """What the file holds."""
     file: Source
-    """Pose file."""
-    size: float
-    """Nominal width of the body in m."""
+    """Pose file, or archive."""
+    size: float | None = None
+    """Nominal width of the body in m; needed for poses."""
     mass: float | None = None
     """Mass in kg, noted in the file; motion under gravity and contact does not depend on it."""
     out: FilePath = None
-    """File to write (.h5, .hdf5 or .npz); by default FILE-trajectories.h5."""
+    """File to write (.h5, .hdf5 or .npz); by default FILE-trajectories.h5, or cube_tosses.npz for contactnets."""
+    sha256: str | None = None
+    """Checksum that the archive must have."""
     scale: float = 1.0
     """Multiplies all recorded lengths."""
     estimate_velocities: bool = False
@@ -49,11 +53,38 @@ class Import:
 
     def run(self) -> None:
         """Do it."""
+        if self.kind == "contactnets":
+            self._convert()
+        else:
+            self._import()
+
+    def _convert(self) -> None:
+        from carom.simulation import contactnets
+
+        out, console = self.out or Path("cube_tosses.npz"), Console()
+        require(out.suffix == ".npz", f"out must end in .npz; it was {out}.")
+        check_writable(out)
+        if not self.file.exists():
+            console.print(f"Fetching {contactnets.URL} ...", highlight=False, soft_wrap=True)
+            contactnets.download(self.file)
+        found = contactnets.convert(self.file, out, sha256=self.sha256)
+        console.print(
+            f"{found['tosses']} tosses ({found['copies']} copies) in {found['sessions']} sessions, {found['samples']} "
+            f"samples; SHA-256 of the archive: {found['sha256']}\nWritten to {out}",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+    def _import(self) -> None:
         from carom.simulation.files import save_recording
         from carom.simulation.pose_checks import check_poses, flight_noise
         from carom.simulation.poses import at_samples, load_poses, velocity_lag, with_velocities
 
-        require(self.size > 0, f"size must be a positive length in m; it was {self.size}.")
+        width = self.size
+        require(
+            width is not None and width > 0, f"size must be the body's width, a positive length in m; it was {width}."
+        )
+        assert width is not None
         require(self.scale > 0, f"scale must be positive; it was {self.scale}.")
         require(self.mass is None or self.mass > 0, f"mass must be positive, in kg; it was {self.mass}.")
         out = self.out or self.file.with_name(f"{self.file.stem}-trajectories.h5")
@@ -62,13 +93,13 @@ class Import:
         poses = eqx.tree_at(lambda p: p.position, poses, poses.position * self.scale)
         if poses.velocity is not None:
             poses = eqx.tree_at(lambda p: p.velocity, poses, poses.velocity * self.scale)
-        findings = check_poses(poses, self.size)
+        findings = check_poses(poses, width)
         if self.estimate_velocities or poses.velocity is None or poses.omega is None:
             poses = with_velocities(poses)
         elif abs(velocity_lag(poses)) > 0.25 * poses.dt:
             # Differences of the past are half a sample old; what is measured is that, with noise.
             poses = at_samples(poses, 0.5 * poses.dt * round(2 * velocity_lag(poses) / poses.dt))
-        about = f"{self.file.name}, width {self.size} m" + (f", mass {self.mass} kg" if self.mass else "")
+        about = f"{self.file.name}, width {width} m" + (f", mass {self.mass} kg" if self.mass else "")
         save_recording(out, poses.to_recording(task=self.task, source=about))
         console = Console()
         table = Table(title=f"{self.file.name}: {len(poses.length)} trajectories at {1 / poses.dt:.0f} Hz")

@@ -93,36 +93,48 @@ class Coulomb(ContactModel):
     F. Cadoux, C. Lemarechal, J. Malick 2011). `iterations` programs are solved in turn for it, from the sliding before:
     the error shrinks by a factor of about the friction squared in each.
 
-    Friction and restitution can depend on speed, with the contact's velocities (m/s) before the impact:
+    Friction and restitution may be less in faster impacts, with the contact's speed of approach `v_n` (m/s):
 
-        e(v_n) = e exp(-restitution_decay |v_n|),   mu(v_t) = mu exp(-friction_decay |v_t|)
+        mu(v_n) = mu (1 - friction_loss (1 - exp(-v_n / loss_speed))),   and e(v_n) likewise with restitution_loss
 
-    and e kept to at most 1. Real bodies bounce less from faster impacts (W. Goldsmith, *Impact*, 1960), which is a
-    positive `restitution_decay`.
+    so that `friction` and `restitution` of the system are those of slow contact. Real bodies bounce less from faster
+    impacts (W. Goldsmith, *Impact*, 1960).
 
-    **Arguments:** `restitution_decay`, `friction_decay` in s/m: leaves of the pytree, which can be learned;
-    `iterations`.
+    **Arguments:** `friction_loss`, `restitution_loss`, from 0 to 1, and `loss_speed` (m/s), positive: leaves of the
+    pytree, which can be learned; `iterations`.
 
-    **Raises:** `CaromError` for decays that are not one number, and for less than one iteration.
+    **Raises:** `CaromError` for values that are out of range or not one number, and for less than one iteration.
     """
 
-    restitution_decay: Float[Array, ""]
-    friction_decay: Float[Array, ""]
+    friction_loss: Float[Array, ""]
+    restitution_loss: Float[Array, ""]
+    loss_speed: Float[Array, ""]
     iterations: int = eqx.field(static=True)
 
-    def __init__(self, restitution_decay: ArrayLike = 0.0, friction_decay: ArrayLike = 0.0, iterations: int = 3):
-        self.restitution_decay, self.friction_decay = as_floats(restitution_decay), as_floats(friction_decay)
-        for name in ("restitution_decay", "friction_decay"):
-            shape = getattr(self, name).shape
-            require(shape == (), f"{name} must be one number; its shape was {shape}.")
+    def __init__(
+        self,
+        friction_loss: ArrayLike = 0.0,
+        restitution_loss: ArrayLike = 0.0,
+        loss_speed: ArrayLike = 0.3,
+        iterations: int = 3,
+    ):
+        self.friction_loss, self.restitution_loss = as_floats(friction_loss), as_floats(restitution_loss)
+        self.loss_speed = as_floats(loss_speed)
+        for name in ("friction_loss", "restitution_loss", "loss_speed"):
+            value = getattr(self, name)
+            require(value.shape == (), f"{name} must be one number; its shape was {value.shape}.")
+            speed = name == "loss_speed"
+            good = (value > 0) & jnp.isfinite(value) if speed else (value >= 0) & (value <= 1)
+            require_values(name, value, good, "a positive speed in m/s" if speed else "a share from 0 to 1")
         require(iterations >= 1, f"iterations must be at least 1; it was {iterations}.")
         self.iterations = iterations
 
     def __call__(self, state, *, smoothing=0.0):
-        approach = jnp.maximum(-state.velocity[:, 0], 0)
-        restitution = jnp.minimum(state.restitution * jnp.exp(-self.restitution_decay * approach), 1)
-        friction = state.friction * jnp.exp(-self.friction_decay * _length(state.velocity[:, 1:]))
-        at_speed = state._replace(restitution=restitution, friction=friction)
+        lost = 1 - jnp.exp(-jnp.maximum(-state.velocity[:, 0], 0) / self.loss_speed)
+        at_speed = state._replace(
+            friction=state.friction * (1 - self.friction_loss * lost),
+            restitution=state.restitution * (1 - self.restitution_loss * lost),
+        )
         return _two_phase_jump(at_speed, smoothing, sliding=self.iterations)
 
 
@@ -289,18 +301,16 @@ def two_phases(
 
         def solved(start):
             solution = _solve(program, start, friction, least, smoothing, reference=v)
-            return solution, (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
+            return (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape), solution
 
-        def lifted(change):
-            return velocity.at[..., 0].add(friction * _length((velocity + change)[..., 1:]))
+        def without_lift(change, _):
+            return solved(velocity.at[..., 0].add(friction * _length((velocity + change)[..., 1:])))
 
         if sliding:
-            change, solutions = jax.lax.scan(
-                lambda change, _: solved(lifted(change))[::-1], jnp.zeros_like(v), length=sliding
-            )
+            change, solutions = jax.lax.scan(without_lift, jnp.zeros_like(v), length=sliding)
             solution = jax.tree.map(lambda s: s[-1], solutions)
         else:
-            solution, change = solved(velocity)
+            change, solution = solved(velocity)
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
         return (velocity + change, lower), solution
 

@@ -46,14 +46,19 @@ Quantity = Literal[
     "gravity",
     "friction",
     "restitution",
-    "restitution_decay",
-    "friction_decay",
+    "friction_loss",
+    "restitution_loss",
+    "loss_speed",
     "table_height",
     "table_tilt_x",
     "table_tilt_y",
 ]
 CENTER: tuple[Quantity, ...] = ("center_of_mass_x", "center_of_mass_y", "center_of_mass_z")
 PLAIN: tuple[Quantity, ...] = ("half_width", "corner_radius", "inertia", *CENTER, "friction", "restitution")
+
+
+ContactName = Literal["coulomb", "cm", "cmr", "lcp"]
+LOSSES = {"friction_loss", "restitution_loss", "loss_speed"}
 
 
 class Parameter(NamedTuple):
@@ -95,10 +100,6 @@ def _inertia(system: System, value):
     return eqx.tree_at(_moments, system, moments / jnp.sum(moments) * 1.5 * value)
 
 
-def _speed(system: Any) -> Any:
-    return system.contact_model
-
-
 def _center_of_mass(axis: int) -> Parameter:
     """The centre of mass is to the box's centre as the box's centre is to it, turned round."""
 
@@ -106,6 +107,10 @@ def _center_of_mass(axis: int) -> Parameter:
         return eqx.tree_at(lambda s: box_of(s).center, system, box_of(system).center.at[axis].set(-value))
 
     return Parameter(lambda s: -box_of(s).center[axis], write, -1.0, 1.0, 1e-3, "m")
+
+
+def _contact_model(system: Any) -> Any:
+    return system.contact_model
 
 
 def _tilt(axis: int) -> Parameter:
@@ -125,8 +130,9 @@ PARAMETERS: dict[str, Parameter] = {
     "gravity": Parameter(lambda s: jnp.linalg.norm(_acceleration(s)), _gravity, 0.0, np.inf, 0.1, "m/s^2"),
     "friction": _leaf(lambda s: s.friction, 0.03, ""),
     "restitution": _leaf(lambda s: s.restitution, 0.08, "", 0.0, 1.0),
-    "restitution_decay": _leaf(lambda s: _speed(s).restitution_decay, 0.5, "s/m", -2.0, 10.0),
-    "friction_decay": _leaf(lambda s: _speed(s).friction_decay, 0.2, "s/m", -2.0, 10.0),
+    "friction_loss": _leaf(lambda s: _contact_model(s).friction_loss, 0.1, "", 0.0, 1.0),
+    "restitution_loss": _leaf(lambda s: _contact_model(s).restitution_loss, 0.1, "", 0.0, 1.0),
+    "loss_speed": _leaf(lambda s: _contact_model(s).loss_speed, 0.1, "m/s", 0.02, 5.0),
     "table_height": Parameter(
         lambda s: box_of(s).point[2],
         lambda s, value: eqx.tree_at(lambda s: box_of(s).point, s, box_of(s).point.at[2].set(value)),
@@ -146,15 +152,20 @@ class TossConfig:
     """How to learn from recorded tosses."""
 
     learn_of_toss: tuple[Quantity, ...] = PLAIN
-    """What is learned of a tossed body; all else is taken from the task. The decays make friction and restitution
-    depend on speed; gravity, table height and tilts absorb biases of the recording."""
+    """What is learned of a tossed body; all else is taken from the task. Gravity, table height and tilts absorb biases
+    of the recording."""
+    toss_extras: tuple[Quantity, ...] = ()
+    """What is learned besides: friction_loss and restitution_loss are what fast impacts lose of friction and
+    restitution."""
+    toss_contact_model: ContactName | None = "coulomb"
+    """Contact model of the tossed body (None: that of the task)."""
     horizons: tuple[int, ...] = (8, 16)
     """Samples that segments around impacts are predicted over, one stage after the other."""
     segments: int = 1000
     """Most segments in a stage."""
-    toss_rounds: int = 4
+    toss_rounds: int = 5
     """Gauss-Newton steps in each stage."""
-    evaluations: int = 150
+    evaluations: int = 60
     """Most evaluations of whole tosses at the end; 0: leave it at the segments."""
     toss_samples: int = 120
     """Samples of a toss that are fitted at the end: bodies rest after that."""
@@ -163,12 +174,23 @@ class TossConfig:
     toss_seed: int = 0
     """Seed of which segments are used where there are more."""
 
+    @property
+    def names(self) -> tuple[Quantity, ...]:
+        """All that is learned, each once."""
+        return tuple(dict.fromkeys((*self.learn_of_toss, *self.toss_extras)))
+
     def check(self) -> None:
         """Raise `CaromError` for a value that cannot be."""
-        unknown = set(self.learn_of_toss) - set(get_args(Quantity))
+        known = get_args(Quantity)
+        for name in ("learn_of_toss", "toss_extras"):
+            unknown = set(getattr(self, name)) - set(known)
+            require(not unknown, f"{name} must name some of {', '.join(known)}; it was {getattr(self, name)}.")
+        require(len(self.names) > 0, f"learn_of_toss must name some of {', '.join(known)}; it was ().")
+        losses = sorted(LOSSES & set(self.names))
         require(
-            not unknown and len(self.learn_of_toss) > 0,
-            f"learn_of_toss must name some of {', '.join(get_args(Quantity))}; it was {self.learn_of_toss}.",
+            not losses or self.toss_contact_model in ("coulomb", None),
+            f"{', '.join(losses)} belong to the contact model coulomb; toss_contact_model was "
+            f"{self.toss_contact_model!r}.",
         )
         for name in ("segments", "toss_rounds", "toss_samples", "substeps"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
@@ -209,10 +231,13 @@ def can_learn_tosses(system: System) -> bool:
 
 
 def prepared(system: System, config: TossConfig) -> System:
-    """The system with a contact model that has what is to be learned, and room for the contacts of a face and more."""
-    if {"restitution_decay", "friction_decay"} & set(config.learn_of_toss):
-        kept = isinstance(system.contact_model, Coulomb)
-        system = system if kept else system.with_contact_model(Coulomb())
+    """The system with the contact model that is chosen, and room for the contacts of a face."""
+    if config.toss_contact_model is not None:
+        system = system.with_contact_model(config.toss_contact_model)
+    require(
+        isinstance(system.contact_model, Coulomb) or not LOSSES & set(config.names),
+        f"{', '.join(sorted(LOSSES))} belong to the contact model coulomb; the system has another.",
+    )
     return system.with_max_active(4)
 
 
@@ -260,9 +285,23 @@ def _tosses(system, names, values, x0, v0, stepper, samples, substeps):
     return _predict(with_values(system, names, values), x0, v0, stepper, samples, substeps)
 
 
-@eqx.filter_jit
+BATCH = 100
+"""Segments that are simulated at once; batches are filled up, so that there is one program whatever their number."""
+
+
 def _segments(system, names, values, x0, v0, end, stepper, samples, substeps):
-    """Residuals (S, samples, points, 3) of segments and their derivatives by the values, in one direction each."""
+    """Residuals (S, samples, points, 3) of segments and their derivatives (..., p) by the values."""
+    count = len(x0)
+    rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1).reshape(-1, BATCH)
+    parts = [
+        _segment_batch(system, names, values, x0[r], v0[r], end[r], stepper, samples, substeps)
+        for r in jnp.asarray(rows)
+    ]
+    return (np.concatenate([np.asarray(part) for part in each])[:count] for each in zip(*parts, strict=True))
+
+
+@eqx.filter_jit
+def _segment_batch(system, names, values, x0, v0, end, stepper, samples, substeps):
 
     def residual(values):
         x = _predict(with_values(system, names, values), x0, v0, stepper, samples, substeps)
@@ -320,8 +359,8 @@ def _stage(system: System, names, values, recording: Recording, horizon: int, co
     stepper = toss_stepper(recording.dt, config.substeps)
     solution = None
     for _ in range(config.toss_rounds):
-        residual, columns = map(
-            np.asarray, _segments(system, names, jnp.asarray(values), x0, v0, end, stepper, horizon, config.substeps)
+        residual, columns = _segments(
+            system, names, jnp.asarray(values), x0, v0, end, stepper, horizon, config.substeps
         )
         residual = np.concatenate([residual[..., :1, :], residual[..., 1:, :] - residual[..., :1, :]], axis=-2) * reach
         first = columns[..., :1, :, :]
@@ -372,7 +411,7 @@ def learn_tosses(
         "tosses are learned for one rigid body with a CornerPlane contact under Gravity; this system is another.",
     )
     require(recording.x.shape[2:] == (4, 3), f"tosses have 4 points in 3D; the recording has {recording.x.shape[2:]}.")
-    system, names = prepared(skeleton, config), config.learn_of_toss
+    system, names = prepared(skeleton, config), config.names
     values = read_values(system, names)
     known = [] if run is None else run.metrics()
     started = time.monotonic() - (known[-1]["seconds"] if known else 0.0)
@@ -441,7 +480,7 @@ def _search(system, names, values, recording, config: TossConfig, before: list[d
         shown.update(len(config.horizons) + made, f"whole tosses {best[0]:.4f}: " + _named(names, best[1]))
         return known[key]
 
-    simplex = np.concatenate([np.zeros((1, len(names))), np.eye(len(names))])
+    simplex = np.concatenate([np.zeros((1, len(names))), 0.5 * np.eye(len(names))])
     options = {"maxfev": config.evaluations, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}
     scipy.optimize.minimize(loss, np.zeros(len(names)), method="Nelder-Mead", options=options)
     return best[1], made
