@@ -16,6 +16,7 @@ from carom.cli.control import ControlCommand
 from carom.cli.evaluate import Evaluate
 from carom.cli.import_data import Import
 from carom.cli.learn import Learn
+from carom.cli.reproduce import Reproduce
 from carom.cli.simulate import Simulate
 from carom.errors import CaromError
 
@@ -25,6 +26,7 @@ Command = (
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[ControlCommand, tyro.conf.subcommand("control")]
     | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
 )
 
 

@@ -131,6 +131,8 @@ def _step(H, g, prior, pull, change, lower, upper):
         if not outside.any():
             break
         held |= outside
+        if held.all():
+            break
     return np.clip(target, lower, upper)
 
 

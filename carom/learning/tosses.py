@@ -339,11 +339,15 @@ def choose_segments(
     return chosen[np.sort(rng.permutation(len(chosen))[:count])]
 
 
+DAMPING = 1e-2
+"""Curvature added for each quantity, in units of its scale and of errors of 1 mm: what no segment tells stays."""
+
+
 def _stage(system: System, names, values, recording: Recording, horizon: int, config: TossConfig):
     """Gauss-Newton steps over one horizon: new values, and the last solution (in units of the scales)."""
     steps = choose_segments(recording, system, horizon, config.segments, config.toss_seed)
     require(
-        len(steps) >= 3 * len(names),
+        len(steps) >= len(names),
         f"the recording has {len(steps)} segments of {horizon} samples around impacts, too few for {len(names)} "
         "quantities. Give more tosses, learn less, or use shorter horizons.",
     )
@@ -370,7 +374,7 @@ def _stage(system: System, names, values, recording: Recording, horizon: int, co
         blocks = Blocks(flat[0][fine] / 1e-3, flat[1][fine] / 1e-3, cluster[fine], np.zeros(int(fine.sum()), int))
         solution = solve(
             blocks,
-            1e-4 * np.eye(len(names)),
+            DAMPING * np.eye(len(names)),
             np.zeros(len(names)),
             np.maximum((lower - values) / scale, -2.0),
             np.minimum((upper - values) / scale, 2.0),

@@ -1,5 +1,6 @@
 """The named systems. A new one is a `Task` object, listed here."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -105,6 +106,16 @@ def make_recordings(
     whole = recording_of(trajectory, task=system.name, source=source)
     ends = np.cumsum([n for _, n in parts])
     return [whole.select(np.arange(end - n, end)) for end, (_, n) in zip(ends, parts, strict=True)]
+
+
+def noisy(name: str, recording: Recording, sd: float, rng: np.random.Generator) -> Recording:
+    """A recording of the task `name` with normal errors: on angles and rates of pendulums, else on every number.
+
+    **Arguments:** `sd`, standard deviation in rad and rad/s, or m and m/s.
+    """
+    require(0 <= sd < np.inf, f"sd must be a finite number of at least 0; it was {sd}.")
+    x, v = find_task(name).add_noise(recording.x, recording.v, sd, rng)
+    return dataclasses.replace(recording, x=x, v=v)
 
 
 LEAST_TEST_STEPS = 100

@@ -30,6 +30,12 @@ class Task(eqx.Module):
     def sample(self, system: System, key: PRNGKeyArray, n: int) -> tuple[Float[Array, "N n d"], Float[Array, "N n d"]]:
         """`n` initial states: positions (m) and velocities (m/s)."""
 
+    def add_noise(
+        self, x: Float[np.ndarray, "N T n d"], v: Float[np.ndarray, "N T n d"], sd: float, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "N T n d"], Float[np.ndarray, "N T n d"]]:
+        """Recorded states with normal errors of `sd` on every coordinate (m) and velocity (m/s)."""
+        return x + sd * rng.normal(size=x.shape), v + sd * rng.normal(size=v.shape)
+
 
 T = TypeVar("T")
 

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from carom.contact.candidates import DiskPlane
@@ -24,6 +25,16 @@ def chain_state(
     links = lengths[..., None] * jnp.stack([jnp.sin(angles), -jnp.cos(angles)], axis=-1)
     spins = (lengths * rates)[..., None] * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     return jnp.cumsum(links, axis=-2), jnp.cumsum(spins, axis=-2)
+
+
+def chain_angles(
+    x: Float[np.ndarray, "*b n 2"], v: Float[np.ndarray, "*b n 2"]
+) -> tuple[Float[np.ndarray, "*b n"], Float[np.ndarray, "*b n"], Float[np.ndarray, "*b n"]]:
+    """Angles (rad), rates (rad/s) and lengths (m) of the links: the inverse of `chain_state`."""
+    links, spins = (np.diff(part, axis=-2, prepend=0.0) for part in (x, v))
+    lengths = np.linalg.norm(links, axis=-1)
+    rates = (links[..., 0] * spins[..., 1] - links[..., 1] * spins[..., 0]) / lengths**2
+    return np.arctan2(links[..., 0], -links[..., 1]), rates, lengths
 
 
 class ChainedPendulum(Task):
@@ -61,6 +72,13 @@ class ChainedPendulum(Task):
             return chain_state(angles, jax.random.normal(key_rate, shape, lengths.dtype), lengths)
 
         return sample_free(system, key, n, draw)
+
+    def add_noise(self, x, v, sd, rng):
+        """Errors on angles (rad) and rates (rad/s), so that links keep their lengths."""
+        angles, rates, _ = chain_angles(x, v)
+        angles, rates = (part + sd * rng.normal(size=part.shape) for part in (angles, rates))
+        out = chain_state(jnp.asarray(angles), jnp.asarray(rates), jnp.asarray(self.lengths, angles.dtype))
+        return np.asarray(out[0]), np.asarray(out[1])
 
 
 CP3 = ChainedPendulum(

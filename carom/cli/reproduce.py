@@ -1,0 +1,124 @@
+"""`carom reproduce TABLE`: train what a table of the paper needs, measure, and write the table."""
+
+import concurrent.futures
+import dataclasses
+import multiprocessing
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import tyro
+from rich.console import Console
+
+from carom.checks import require
+
+Choice = Literal["s1", "s2", "s3", "s4", "s5", "s6", "s7", "s8", "s9", "s10", "properties", "all", "page"]
+MINUTES = {"bp5-e": 1.5, "bp5": 1.5, "bd5": 4, "cp3-e": 0.7, "cp3": 0.7, "gyro-e": 1, "gyro": 1.2, "rope": 2}
+"""What a training takes on two cores, about; other tasks longer."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reproduce:
+    """Learn what a table of the paper's supplement needs, measure it, and write results/TABLE.json and TABLE.md.
+
+    Finished trainings are skipped, stopped ones go on. `all`: every table; `page`: docs/results.md from what there is.
+    """
+
+    table: Annotated[
+        Choice, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(get_args(Choice)), help="Which table.")
+    ]
+    seeds: int = 3
+    """Trainings of each kind, with seeds 0, 1, ..."""
+    runs: Path = Path("runs/reproduce")
+    """Folder of the trainings."""
+    results: Path = Path("results")
+    """Folder of the tables."""
+    page: Path = Path("docs/results.md")
+    """File that `page` writes."""
+    workers: int = 1
+    """Trainings at the same time, each a process."""
+    only: str = ""
+    """Only trainings whose name has this in it (cp3-e, chnn, seed0, ...); other cells stay as they are."""
+    quick: bool = False
+    """A smoke run: the first two trainings of the table, few data and epochs; the numbers mean nothing."""
+
+    def after_interrupt(self) -> str:
+        """What to say when interrupted."""
+        return "Finished trainings are kept: the same command goes on."
+
+    def run(self) -> None:
+        """Do it."""
+        from carom.reproduction import results
+        from carom.reproduction.tables import BUILDERS
+
+        console = Console()
+        require(self.seeds >= 1, f"seeds must be at least 1; it was {self.seeds}.")
+        require(self.workers >= 1, f"workers must be at least 1; it was {self.workers}.")
+        if self.table == "page":
+            from carom.atomic import check_writable, write_whole
+
+            check_writable(self.page)
+            write_whole(self.page, results.page(self.results).encode())
+            console.print(f"Written to {self.page}", soft_wrap=True, highlight=False)
+            return
+        for name in BUILDERS if self.table == "all" else [self.table]:
+            self._one(name, console)
+
+    def _one(self, name: Any, console: Console) -> None:
+        from carom.reproduction import results
+        from carom.reproduction.jobs import Job
+        from carom.reproduction.tables import table
+
+        wanted = table(name)
+        seeds, folder = (1, self.runs / "quick") if self.quick else (self.seeds, self.runs)
+        every = wanted.jobs(seeds)
+        jobs = [job for job in every if self.only in job.name]
+        require(
+            bool(jobs) or not every,
+            f"only must be in the name of a training of {name}, e.g. {every[0].name if every else ''}; it was "
+            f"{self.only!r}.",
+        )
+        jobs = jobs[:2] if self.quick else jobs
+        todo = [job for job in jobs if not (folder / job.name / "report.json").exists()]
+        minutes = sum(MINUTES.get(job.task, 15.0) for job in todo) / self.workers
+        console.print(
+            f"{name}: {len(todo)} of {len(jobs)} trainings to do"
+            + (f", about {minutes:.0f} minutes" if todo and not self.quick else ""),
+            highlight=False,
+        )
+        reports: dict[Job, Any] = {}
+
+        def keep(job: Job, report: dict[str, Any]) -> None:
+            reports[job] = report
+            content = results.collect(wanted, reports, seeds=seeds, quick=self.quick)
+            results.write(content, self.results / "quick" if self.quick else self.results)
+
+        # Finished trainings that are not asked for now stay in the table.
+        for job in [job for job in every if job in jobs or (folder / job.name / "report.json").exists()]:
+            if job not in todo:
+                keep(job, job.run(folder, quick=self.quick))
+        if self.workers == 1:
+            for job in todo:
+                keep(job, job.run(folder, quick=self.quick, say=lambda text: console.print(text, highlight=False)))
+        else:
+            self._parallel(todo, folder, keep, console)
+        if not every:
+            results.write(results.collect(wanted, {}, seeds=seeds, quick=self.quick), self.results)
+        if self.quick:
+            console.print("A smoke run: the numbers mean nothing.")
+        path = (self.results / "quick" if self.quick else self.results) / f"{name}.md"
+        console.print(f"Written to {path}", soft_wrap=True, highlight=False)
+
+    def _parallel(self, todo, folder: Path, keep, console: Console) -> None:
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(self.workers, mp_context=context) as pool:
+            waiting = {pool.submit(_in_process, job, folder, self.quick): job for job in todo}
+            for done in concurrent.futures.as_completed(waiting):
+                keep(waiting[done], done.result())
+                console.print(f"{waiting[done].name}: done ({len(waiting)} in all)", highlight=False)
+
+
+def _in_process(job: Any, folder: Path, quick: bool) -> dict[str, Any]:
+    from carom.cli.main import configure_jax
+
+    configure_jax()
+    return job.run(folder, quick=quick)

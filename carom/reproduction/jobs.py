@@ -1,0 +1,138 @@
+"""One training of a table: its data, its run folder, its measures."""
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+import carom
+from carom.checks import require
+from carom.learning.config import FORMULATIONS, LearnConfig, Model
+from carom.learning.dataset import Dataset
+from carom.learning.evaluate import evaluate
+from carom.learning.model_file import save_model
+from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
+from carom.learning.train import learn
+from carom.simulation.files import Recording
+from carom.tasks import make_data_sets, noisy, task
+
+TEST_SEED = 1_000_000
+"""Test states have a seed of their own, whatever is learned from."""
+TEST_TRAJECTORIES = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What is learned from what. Jobs that are equal are one training, however many tables ask for it."""
+
+    task: str
+    model: Model = "clnn"
+    contact_model: str = "cm"
+    data: str = "cm"
+    """Contact model that the data are simulated with."""
+    noise: float = 0.0
+    """Standard deviation of errors on every recorded number (angles and rates for pendulums)."""
+    trajectories: int = 800
+    epsilon: float | Literal["learn"] | None = None
+    width: int = 256
+    depth: int = 3
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """A folder's name that says what differs from the defaults."""
+        parts = [self.task, self.model, self.contact_model]
+        if self.data != "cm":
+            parts.append(f"on-{self.data}")
+        for field, label in (("noise", "noise"), ("epsilon", "eps"), ("trajectories", "n"), ("width", "w")):
+            value = getattr(self, field)
+            if value != next(f.default for f in dataclasses.fields(Job) if f.name == field):
+                parts.append(f"{label}{value}")
+        return "-".join([*parts, f"seed{self.seed}"])
+
+    def config(self) -> LearnConfig:
+        """How it is learned: the defaults, and chunks of more states where these are noisy."""
+        return LearnConfig(
+            model=self.model,
+            contact_model=self.contact_model,
+            epsilon=self.epsilon,
+            width=self.width,
+            depth=self.depth,
+            seed=self.seed,
+            epochs=250 if self.model in ("mlp-cd-clnn", "in-cp-clnn", "in-cp-sp") else LearnConfig.epochs,
+        )
+
+    def settings(self, quick: bool) -> dict[str, Any]:
+        """All that decides what comes out."""
+        config = dataclasses.asdict(self._quickened() if quick else self.config())
+        return {**dataclasses.asdict(self), "quick": quick, "config": config}
+
+    def digest(self, quick: bool = False) -> str:
+        """Hash of the settings."""
+        return hashlib.sha256(json.dumps(self.settings(quick), sort_keys=True).encode()).hexdigest()[:12]
+
+    def _quickened(self) -> LearnConfig:
+        return dataclasses.replace(self.config(), epochs=4)
+
+    def run(
+        self, folder: Path, *, quick: bool = False, say: Callable[[str], None] = lambda text: None
+    ) -> dict[str, Any]:
+        """Learn and measure, or go on where a training was stopped, or read what was measured.
+
+        **Raises:** `CaromError` if the folder holds a training with other settings.
+        """
+        settings = self.settings(quick)
+        path = folder / self.name
+        run = RunFolder.open(path) if (path / CONFIG).exists() else RunFolder.create(path, settings)
+        try:
+            before, now = run.read_json(CONFIG), json.loads(json.dumps(settings))
+            require(before == now, f"{path} was learned with other settings. Choose another folder with --runs.")
+            if (path / REPORT).exists():
+                return run.read_json(REPORT)
+            started = time.monotonic()
+            truth = task(self.task)
+            dataset, tests = self._data(quick)
+            if say is not None:
+                say(f"{self.name}: learning from {dataset.train.n_trajectories} trajectories")
+            system, report = learn(truth, dataset, self._quickened() if quick else self.config(), run=run)
+            save_model(path / MODEL, system, formulation=FORMULATIONS[self.model])
+            measures = {
+                name: evaluate(system, test, truth=truth, formulation=FORMULATIONS[self.model])[0]
+                for name, test in tests.items()
+            }
+            content = {
+                "learned": dataclasses.asdict(report),
+                "evaluation": measures,
+                "provenance": {
+                    "digest": self.digest(quick),
+                    "seconds": round(time.monotonic() - started, 1),
+                    "carom": carom.__version__,
+                    "jax": jax.__version__,
+                },
+            }
+            run.write_json(REPORT, content)
+            return run.read_json(REPORT)
+        finally:
+            run.close()
+
+    def _data(self, quick: bool) -> tuple[Dataset, dict[str, Recording]]:
+        """To learn from, and to test with: by the contact model of the data, and by CM where that is another."""
+        truth = task(self.task)
+        count = min(self.trajectories, 64) if quick else self.trajectories
+        key = jax.random.key(self.seed)
+        parts = [(jax.random.fold_in(key, k), n) for k, n in ((0, count), (1, max(count // 8, 2)))]
+        test = (jax.random.fold_in(jax.random.key(self.seed), TEST_SEED), 8 if quick else TEST_TRAJECTORIES)
+        train, val, own = make_data_sets(truth, parts[0], parts[1], test, contact_model=self.data)
+        tests = {self.data: own}
+        if self.data != "cm":
+            tests["cm"] = make_data_sets(truth, parts[1], parts[1], test, contact_model="cm")[2]
+        if self.noise:
+            rng = np.random.default_rng((self.seed, 17))
+            train, val = (noisy(self.task, part, self.noise, rng) for part in (train, val))
+        return Dataset(train, val), tests

@@ -1,0 +1,206 @@
+"""From finished trainings to a table: `results/TABLE.json`, `results/TABLE.md`, and the page of all of them."""
+
+import dataclasses
+import json
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carom.atomic import write_whole
+from carom.reproduction.jobs import Job
+from carom.reproduction.tables import BUILDERS, Cell, Table
+
+ZERO = 1e-4
+"""A printed error of zero is met, and beaten, by one of at most this."""
+TIMES_BETTER = 3.0
+
+
+def deviation(cell: Cell, value: float) -> float:
+    """How far a number is from what it ought to be: its own size for an error, relative for ratios above 1."""
+    if cell.kind == "error":
+        return abs(value)
+    return abs(value - cell.true) / max(abs(cell.true), 1.0)
+
+
+def measured(cell: Cell, values: list[float | None]) -> dict[str, Any]:
+    """A cell's entry: mean over seeds with its 95 % interval, error, the paper's, and their ratio.
+
+    `verdict`: "better" (by `TIMES_BETTER`), "met", "worse", or "" where there is nothing to compare with.
+    """
+    found = [float(v) for v in values if v is not None]
+    finite = bool(found) and len(found) == len(values) and bool(np.all(np.isfinite(found)))
+    mean = float(np.mean(found)) if finite else None
+    spread = float(1.96 * np.std(found, ddof=1) / np.sqrt(len(found))) if finite and len(found) > 1 else None
+    # The error of a cell is the mean of its seeds' errors: that of their mean would be too kind.
+    error = float(np.mean([deviation(cell, v) for v in found])) if finite else None
+    paper_error = None if cell.paper is None else deviation(cell, cell.paper)
+    out: dict[str, Any] = {
+        "row": cell.row,
+        "column": cell.column,
+        "kind": cell.kind,
+        "true": cell.true if cell.kind == "property" else None,
+        "paper": cell.paper,
+        "carom": mean,
+        "ci95": spread,
+        "seeds": len(values),
+        "error": error,
+        "paper_error": paper_error,
+        "ratio": None,
+        "verdict": "",
+        "note": cell.note,
+    }
+    if cell.job is None or paper_error is None:
+        return out
+    if error is None:
+        return {**out, "verdict": "worse", "note": "not finite"}
+    if paper_error < 1e-12:
+        out["verdict"] = "better" if error <= ZERO else "worse"
+    else:
+        out["ratio"] = error / paper_error
+        out["verdict"] = (
+            "better" if out["ratio"] <= 1 / TIMES_BETTER else "met" if out["ratio"] <= 1 + 1e-9 else "worse"
+        )
+    return out
+
+
+def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, quick: bool) -> dict[str, Any]:
+    """All cells of a table of which every seed has a report, with where they come from."""
+    cells = []
+    for cell in table.cells:
+        if cell.job is None:
+            cells.append(measured(cell, []))
+            continue
+        jobs = [dataclasses.replace(cell.job, seed=seed) for seed in range(seeds)]
+        done = [reports[job] for job in jobs if job in reports]
+        if done:
+            cells.append(measured(cell, [cell.read(report) for report in done]))
+        else:
+            cells.append({**measured(dataclasses.replace(cell, job=None), []), "note": "not run yet"})
+    runs = {job.name: report["provenance"] for job, report in reports.items()}
+    return {
+        "table": table.name,
+        "title": table.title,
+        "note": table.note,
+        "quick": quick,
+        "cells": cells,
+        "summary": summary(cells),
+        "runs": runs,
+        "commit": commit(),
+        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+    }
+
+
+def summary(cells: list[dict[str, Any]]) -> dict[str, int]:
+    """How many cells can be compared, are at least as good as the paper's, and are three times better."""
+    verdicts = [cell["verdict"] for cell in cells if cell["verdict"]]
+    return {
+        "compared": len(verdicts),
+        "met": sum(verdict in ("met", "better") for verdict in verdicts),
+        "better": verdicts.count("better"),
+    }
+
+
+def commit() -> str | None:
+    """The commit of the checkout that the package is in, if it is in one."""
+    try:
+        out = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return out.stdout.strip()
+
+
+def write(content: dict[str, Any], folder: Path) -> Path:
+    """Write `TABLE.json` and `TABLE.md` into the folder; returns the former's path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{content['table']}.json"
+    write_whole(path, (json.dumps(content, indent=1) + "\n").encode())
+    write_whole(path.with_suffix(".md"), markdown(content).encode())
+    return path
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.2e}" if value and abs(value) < 1e-3 else f"{value:.5g}"
+
+
+def markdown(content: dict[str, Any]) -> str:
+    """The table as a page's section: a line a cell, with the paper's number, ours, errors and their ratio."""
+    lines = [f"## {content['title']}", ""]
+    if content["quick"]:
+        lines += ["A smoke run (`--quick`): the numbers mean nothing.", ""]
+    lines += [
+        "| row | column | true | paper | carom | error of the paper | error of carom | ratio | |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for cell in content["cells"]:
+        carom = _number(cell["carom"])
+        if cell["ci95"] is not None:
+            carom += f" ± {cell['ci95']:.0e}"
+        row = [
+            cell["row"],
+            cell["column"],
+            _number(cell["true"]),
+            _number(cell["paper"]),
+            carom or cell["note"],
+            _number(cell["paper_error"]),
+            _number(cell["error"]),
+            _number(cell["ratio"]),
+            cell["verdict"],
+        ]
+        lines.append("| " + " | ".join(row) + " |")
+    counts = content["summary"]
+    if counts["compared"]:
+        lines += [
+            "",
+            f"{counts['met']} of {counts['compared']} cells are at least as good as the paper's, {counts['better']} at "
+            "least three times better.",
+        ]
+    if content["note"]:
+        lines += ["", content["note"]]
+    if content["runs"]:
+        seconds = sum(run["seconds"] for run in content["runs"].values())
+        lines += [
+            "",
+            f"{len(content['runs'])} trainings, {seconds / 60:.0f} minutes together; {content['machine']}"
+            + (f"; commit {content['commit']}" if content["commit"] else "")
+            + f". `carom reproduce {content['table']}`.",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def page(folder: Path) -> str:
+    """The page of all tables that the folder has."""
+    lines = [
+        "# The paper's tables, measured again",
+        "",
+        "Made by `carom reproduce`; numbers, seeds, times and settings are in `results/`. A property's error is its "
+        "distance to the true value (relative for mass ratios above one), that of a trajectory `|z - z^| / |z|` over "
+        "positions and velocities together, mean over time and 100 test trajectories, whose states have their own "
+        "seed. The mean is over seeds, after ± half of its 95 % interval. A printed error of zero is met by one of at "
+        f"most {ZERO:g}. Paper: Zhong, Dey, Chakraborty, NeurIPS 2021, supplement.",
+        "",
+    ]
+    total = {"compared": 0, "met": 0, "better": 0}
+    parts = []
+    for name in BUILDERS:
+        path = folder / f"{name}.json"
+        if path.exists():
+            content = json.loads(path.read_text())
+            parts.append(markdown(content))
+            total = {key: total[key] + content["summary"][key] for key in total}
+    lines += [
+        f"Of {total['compared']} cells that can be compared {total['met']} are at least as good as the paper's, and "
+        f"{total['better']} at least three times better.",
+        "",
+    ]
+    return "\n".join([*lines, "\n".join(parts)])
