@@ -9,6 +9,7 @@ from systems import refused
 
 import carom
 from carom.mechanics.bodies import recover_velocity
+from carom.simulation.corner_impacts import mass_balance
 from carom.simulation.pose_checks import check_poses, find_copies, flight_noise
 from carom.simulation.poses import (
     PoseRecording,
@@ -200,3 +201,37 @@ def test_the_recorded_cube_shows_its_quirks(reference_dir):
     flight = free_flight(poses)[:, :-1]
     estimated = with_velocities(poses).velocity[:, :-1]
     assert np.median(np.abs(estimated - poses.velocity[:, :-1])[..., :2][flight]) < 5e-3
+
+
+def test_impacts_at_one_corner_tell_where_the_mass_is():
+    """Impulses of any size and direction at the lowest corner of a box with its mass off the middle; noise too."""
+    rng = np.random.default_rng(0)
+    center, inertia, fall = np.array([2e-3, -1e-3, 6e-3]), 2.5e-3, np.array([0, 0, -9.81])
+    signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+    position, rotation = np.zeros((80, 21, 3)), np.zeros((80, 21, 3, 3))
+    time = (np.arange(21) - 10.4) * DT  # the impact is at time 0
+    for k in range(80):
+        turn = Rotation.random(random_state=k)
+        v, w = np.array([*rng.normal(size=2), -1.2]), rng.normal(size=3) * 4
+        corners = turn.apply(signs * WIDTH / 2 - center)
+        arm = corners[corners[:, 2].argmin()]
+        impulse = np.array([*0.1 * rng.normal(size=2), rng.uniform(0.4, 0.7)])
+        after = v + impulse, w + np.cross(arm, impulse) / inertia
+        for t, moment in enumerate(time):
+            speed, rate = (v, w) if moment < 0 else after
+            now = Rotation.from_rotvec(rate * moment) * turn
+            position[k, t] = np.array([0, 0, -arm[2]]) + speed * moment + fall * moment**2 / 2 - now.apply(center)
+            rotation[k, t] = now.as_matrix()
+    quaternion = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(scalar_first=True).reshape(80, 21, 4)
+    position += 2e-5 * rng.normal(size=position.shape)
+    poses = PoseRecording.of(position, quaternion, dt=DT)
+    found = mass_balance(poses, WIDTH)
+    assert found is not None
+    assert found.impacts > 30
+    assert np.allclose(found.center, center, atol=3e-4)
+    assert found.inertia == pytest.approx(inertia, rel=0.03)
+    middle, best = found.unexplained
+    assert best < 0.05 < middle
+    (finding,) = [f for f in check_poses(poses, WIDTH) if f.check.startswith("centre of mass")]
+    assert "not in the middle" in finding.advice
+    assert mass_balance(poses.select(np.arange(5)), WIDTH) is None

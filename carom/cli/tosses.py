@@ -24,12 +24,12 @@ from carom.learning.protocols import (
     toss_errors,
 )
 from carom.learning.run import MODEL, REPORT, RunFolder
-from carom.learning.tosses import TossConfig, TossReport, learn_tosses, predict_tosses
+from carom.learning.tosses import CENTER, TossConfig, TossReport, learn_tosses, predict_tosses
 from carom.simulation.files import Recording
 from carom.system import System
 
-PUBLISHED = {"friction": 0.18, "restitution": 0.125}
-"""Of the acrylic cube (Pfrommer, Halm, Posa, CoRL 2020)."""
+PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": 8.1e-4, **dict.fromkeys(CENTER, 0.0)}
+"""Of the acrylic cube (Pfrommer, Halm, Posa, CoRL 2020), with its mass in the middle."""
 
 
 def learn_and_measure(
@@ -39,6 +39,7 @@ def learn_and_measure(
     system, report = learn_tosses(skeleton, train, config, run=run)
     save_model(run.path / MODEL, system)
     console.print(estimate_table(report, skeleton.name))
+    console.print("Mass is not learned: forces are in proportion to it, so that it drops out of the motion.")
     measures = measure(console, run, system, val, "A", nominal_width(skeleton))
     run.write_json(REPORT, {"learned": dataclasses.asdict(report), "evaluation": measures})
     console.print(f"Done ({report.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
@@ -60,7 +61,7 @@ def estimate_table(report: TossReport, name: str) -> Table:
             f"{quantity} ({estimate.unit})" if estimate.unit else quantity,
             f"{estimate.value:.5g}",
             "" if estimate.standard_error is None else f"{estimate.standard_error:.1g}",
-            "" if known is None else f"{known}",
+            "" if known is None else f"{known:g}",
         )
     return table
 

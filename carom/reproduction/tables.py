@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import json
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import resources
 from typing import Any, Literal
 
@@ -69,7 +69,7 @@ class Table:
 @functools.cache
 def paper() -> dict[str, Any]:
     """The printed figures, by table."""
-    return json.loads((resources.files("carom.reproduction") / "paper.json").read_text())
+    return json.loads((resources.files("carom.reproduction") / "paper.json").read_text(), parse_int=float)
 
 
 def table(name: TableName) -> Table:
@@ -99,9 +99,7 @@ def _mass_table(name: Literal["s1", "s2", "s3"], title: str, tasks: dict[str, Ca
     return Table(name, title, tuple(cells), "Errors are relative to the true ratio.")
 
 
-def _properties_of(
-    name: str, row: str, column: str, job: Job, printed: list[float] | None, index: int = 0
-) -> Iterator[Cell]:
+def _properties_of(row: str, column: str, job: Job, printed: Sequence[float] | None, index: int = 0) -> Iterator[Cell]:
     truth = task(job.task)
     for k, quantity in enumerate(("friction", "restitution")):
         true = float(getattr(truth, quantity)[index])
@@ -127,7 +125,7 @@ def _s4() -> Table:
     cells = []
     for row, data in (("trained on CM data", "cm"), ("trained on LCP data", "lcp")):
         for system, printed in paper()["s4"]["rows"][row].items():
-            cells += _properties_of("s4", row, system, Job(system, data=data), printed)
+            cells += _properties_of(row, system, Job(system, data=data), printed)
     return Table("s4", "S.4: contact properties from LCP data", tuple(cells))
 
 
@@ -148,7 +146,7 @@ def _s6() -> Table:
     cells = []
     for row, noise in (("0", 0.0), ("N(0,0.01)", 0.01), ("N(0,0.05)", 0.05)):
         for system, printed in paper()["s6"]["rows"][row].items():
-            cells += _properties_of("s6", row, system, Job(system, noise=noise), printed)
+            cells += _properties_of(row, system, Job(system, noise=noise), printed)
     return Table("s6", "S.6: contact properties from noisy data", tuple(cells))
 
 
@@ -162,7 +160,7 @@ def _s7() -> Table:
     cells = []
     for row, epsilon in epsilons.items():
         for system, printed in paper()["s7"]["rows"][row].items():
-            cells += _properties_of("s7", row, system, Job(system, contact_model="cmr", epsilon=epsilon), printed)
+            cells += _properties_of(row, system, Job(system, contact_model="cmr", epsilon=epsilon), printed)
     return Table("s7", "S.7: the regulariser of CMr", tuple(cells))
 
 
@@ -208,7 +206,7 @@ def _properties() -> Table:
     for model, (contact, learned) in MODELS.items():
         for system in TASKS:
             for index in range(task(system).n_properties):
-                cells += _properties_of("properties", model, system, Job(system, learned, contact), None, index)
+                cells += _properties_of(model, system, Job(system, learned, contact), None, index)
     return Table("properties", "Contact properties of the eight tasks (the paper shows them in a figure)", tuple(cells))
 
 

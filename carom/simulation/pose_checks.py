@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from carom.simulation.corner_impacts import mass_balance
 from carom.simulation.poses import PoseRecording, flight_acceleration, free_flight, velocity_lag
 
 STANDARD_GRAVITY = 9.81
@@ -21,7 +22,7 @@ class Finding(NamedTuple):
 
 def check_poses(poses: PoseRecording, width: float) -> list[Finding]:
     """What a tossed cube of this nominal `width` (m) shows; everything is measured on the recording."""
-    out = [_gravity(poses), _rest_height(poses, width), _lowest(poses, width), _tilt(poses)]
+    out = [_gravity(poses), _rest_height(poses, width), _lowest(poses, width), _tilt(poses), _mass(poses, width)]
     if poses.velocity is not None:
         lag = velocity_lag(poses) / poses.dt
         late = abs(lag) > 0.25
@@ -88,6 +89,24 @@ def _tilt(poses: PoseRecording) -> Finding:
     tilt = float(np.degrees(np.median(np.arccos(np.minimum(up, 1)))))
     advice = "poses have a bias that each toss keeps: expect no better predictions of rotation"
     return Finding("tilt at rest, median", f"{tilt:.2f} degrees", advice if tilt > 0.2 else "")
+
+
+def _mass(poses: PoseRecording, width: float) -> Finding:
+    found = mass_balance(poses, width)
+    if found is None:
+        return Finding("centre of mass", "too few impacts at one corner to tell", "")
+    x, y, z = 1e3 * found.center
+    middle, best = found.unexplained
+    advice = (
+        f"not in the middle, about which {middle:.0%} of the change of angular momentum are left over; about this "
+        f"point {best:.0%} are: learn it"
+    )
+    off = np.linalg.norm(found.center) > 0.01 * width and best < 0.7 * middle
+    return Finding(
+        f"centre of mass, by {found.impacts} impacts at one corner",
+        f"({x:.1f}, {y:.1f}, {z:.1f}) mm",
+        advice if off else "",
+    )
 
 
 def find_copies(poses: PoseRecording) -> list[tuple[int, int]]:

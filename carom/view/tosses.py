@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from carom.learning.protocols import TossErrors, body_points, lowest_corner
 from carom.simulation.files import Recording
@@ -83,6 +84,9 @@ def error_figure(runs: dict[str, TossErrors], path: str | os.PathLike[str]) -> P
         left.set_ylabel("tosses (%)")
         for axes in (left, right):
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.set_ylim(0, 100)
         right.legend(loc="lower right", title="dashed: means")
         return save_png(figure, path)

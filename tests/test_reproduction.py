@@ -1,0 +1,171 @@
+"""The paper's tables: which trainings they need, how cells are judged, and what is written; no training but one."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import refused
+
+import carom
+from carom.cli.main import main
+from carom.reproduction.jobs import Job
+from carom.reproduction.results import collect, markdown, measured, page, write
+from carom.reproduction.tables import BUILDERS, Cell, paper, table
+from carom.tasks import noisy
+from carom.tasks.pendulums import chain_angles, chain_state
+
+
+def report_of(cell: Cell, value: float) -> dict:
+    """A report of a job in which every quantity and error is `value`."""
+    filled = {"friction": [value] * 40, "restitution": [value] * 40, "mass_ratio": [value] * 12}
+    provenance = {"digest": "x", "seconds": 60.0, "carom": "0", "jax": "0"}
+    errors = {name: {"trajectory_error": value} for name in ("cm", "lcp")}
+    return {"learned": filled, "evaluation": errors, "provenance": provenance}
+
+
+PRINTED = {"s1": 16, "s2": 16, "s3": 16, "s4": 16, "s5": 12, "s6": 12, "s7": 16, "s8": 2, "s9": 40, "s10": 12}
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_every_printed_number_has_a_cell(name):
+    wanted = table(name)
+    assert sum(cell.paper is not None for cell in wanted.cells) == PRINTED.get(name, 0)
+    assert len({(cell.row, cell.column) for cell in wanted.cells}) == len(wanted.cells)
+    for cell in wanted.cells:
+        assert (cell.job is None) <= (cell.note != "")
+        if cell.kind == "property" and cell.paper is not None:
+            assert abs(cell.paper - cell.true) < 0.5
+        if cell.job is not None:
+            value = cell.read(report_of(cell, 0.25))
+            assert value == 0.25
+    jobs = wanted.jobs(2)
+    assert len(jobs) == len(set(jobs)) == len({job.name for job in jobs})
+
+
+def test_true_values_are_those_of_the_supplement():
+    for name, columns in (("s1", [1, 1, 1, 1]), ("s2", [2, 6, 8, 10])):
+        assert [cell.true for cell in table(name).cells[:4]] == pytest.approx(columns)
+        assert paper()[name]["true"] == columns
+    true = {cell.column: cell.true for cell in table("s3").cells}
+    assert list(true.values()) == pytest.approx([2.0, 1.5, 0.65, 0.75])
+    true = {cell.column: cell.true for cell in table("s4").cells}
+    assert true["gyro mu"] == 0.1
+    assert true["gyro e"] == 0.8
+
+
+JOB = Job("cp3")
+
+
+@pytest.mark.parametrize(
+    ("true", "printed", "values", "verdict"),
+    [
+        (0.5, 0.53, [0.505, 0.495], "better"),  # errors of 0.005 do not cancel: 6 times better than 0.03
+        (0.5, 0.53, [0.51, 0.53], "met"),
+        (0.5, 0.53, [0.50, 0.60], "worse"),
+        (0.0, 0.0, [5e-5], "better"),
+        (0.0, 0.0, [2e-4], "worse"),
+        (2.0, 2.002, [2.0005], "better"),  # relative: 2.5e-4 for 1e-3
+        (0.5, 0.53, [float("nan")], "worse"),
+        (0.5, 0.53, [None], "worse"),
+        (0.5, None, [0.6], ""),
+    ],
+)
+def test_cells_are_judged_by_their_errors(true, printed, values, verdict):
+    cell = Cell("row", "column", "property", JOB, lambda report: None, true, printed)
+    assert measured(cell, values)["verdict"] == verdict
+
+
+def test_the_mean_and_its_interval():
+    cell = Cell("row", "column", "error", JOB, lambda report: None, paper=4e-3)
+    found = measured(cell, [1e-3, 2e-3, 3e-3])
+    assert found["carom"] == pytest.approx(2e-3)
+    assert found["ci95"] == pytest.approx(1.96 * 1e-3 / np.sqrt(3))
+    assert found["ratio"] == pytest.approx(0.5)
+    assert found["verdict"] == "met"
+
+
+def test_tables_are_written_with_what_is_there(tmp_path):
+    wanted = table("s6")
+    cell = wanted.cells[0]
+    assert cell.job is not None
+    job = dataclasses.replace(cell.job, seed=0)
+    content = collect(wanted, {job: report_of(cell, 0.5)}, seeds=1, quick=False)
+    assert content["summary"]["compared"] == 2  # both properties of one training
+    assert [c["note"] for c in content["cells"]].count("not run yet") == 10
+    assert content["runs"] == {"cp3-clnn-cm-seed0": {"digest": "x", "seconds": 60.0, "carom": "0", "jax": "0"}}
+    path = write(content, tmp_path / "results")
+    assert json.loads(path.read_text())["cells"][0]["carom"] == 0.5
+    text = path.with_suffix(".md").read_text()
+    assert text == markdown(content)
+    assert "| 0 | cp3 mu | 0.5 | 0.5 | 0.5 |" in text
+    assert "1 of 2 cells are at least as good" in text
+    whole = page(tmp_path / "results")
+    assert "Of 2 cells that can be compared 1 are" in whole
+    assert text in whole
+
+
+def test_noise_of_pendulums_is_on_angles_and_rates():
+    truth = carom.task("cp3")
+    rng = np.random.default_rng(0)
+    angles, rates = rng.uniform(-2, 2, size=(2, 50, 11, 3))
+    lengths = np.array([0.35, 0.4, 0.35])
+    x, v = (np.asarray(part) for part in chain_state(*map(jnp.asarray, (angles, rates, lengths))))
+    exact = carom.Recording.of(x, v, dt=0.01, task="cp3")
+    found = noisy("cp3", exact, 0.05, rng)
+    assert np.abs(np.asarray(truth.constraints(jnp.asarray(found.x)))).max() < 1e-12
+    again = chain_angles(found.x, found.v)
+    assert np.allclose(again[2], lengths)
+    assert np.std(again[0] - angles) == pytest.approx(0.05, rel=0.05)
+    assert np.std(again[1] - rates) == pytest.approx(0.05, rel=0.05)
+    points = noisy("bp5", exact, 0.05, rng)
+    assert np.std(points.x - x) == pytest.approx(0.05, rel=0.05)
+    assert np.array_equal(noisy("cp3", exact, 0.0, rng).length, exact.length)
+    with refused("sd must be a finite number of at least 0; it was -1"):
+        noisy("cp3", exact, -1.0, rng)
+
+
+def test_jobs_have_names_and_digests_of_their_settings():
+    jobs = [JOB, Job("cp3", noise=0.05), Job("cp3", epsilon="learn", contact_model="cmr"), Job("cp3", data="lcp")]
+    assert [job.name for job in jobs] == [
+        "cp3-clnn-cm-seed0",
+        "cp3-clnn-cm-noise0.05-seed0",
+        "cp3-clnn-cmr-epslearn-seed0",
+        "cp3-clnn-cm-on-lcp-seed0",
+    ]
+    assert len({job.digest() for job in jobs} | {JOB.digest(quick=True)}) == 5
+
+
+def test_wrong_requests_are_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for arguments, message in (
+        (["s3", "--seeds", "0"], "seeds must be at least 1; it was 0"),
+        (["s3", "--only", "cp4"], "only must be in the name of a training of s3, e.g. cp3-clnn-cm-seed0; it was 'cp4'"),
+        (["s3", "--workers", "0"], "workers must be at least 1; it was 0"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(["reproduce", *arguments])
+        assert stopped.value.code == 2
+        assert message in capsys.readouterr().err
+    path = tmp_path / "runs" / "reproduce" / JOB.name
+    path.mkdir(parents=True)
+    (path / "config.json").write_text("{}")
+    with refused("was learned with other settings. Choose another folder with --runs."):
+        JOB.run(tmp_path / "runs" / "reproduce")
+
+
+@pytest.mark.slow
+def test_a_quick_table_and_what_is_finished_is_not_done_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAROM_CACHE", "")
+    main(["reproduce", "s3", "--quick"])
+    assert "2 of 2 trainings to do" in capsys.readouterr().out
+    content = json.loads((tmp_path / "results" / "quick" / "s3.json").read_text())
+    assert content["quick"]
+    assert sum(cell["carom"] is not None for cell in content["cells"]) == 4
+    main(["reproduce", "s3", "--quick"])
+    assert "0 of 2 trainings to do" in capsys.readouterr().out
+    assert json.loads((tmp_path / "results" / "quick" / "s3.json").read_text())["cells"] == content["cells"]
+    main(["reproduce", "page", "--results", "results/quick", "--page", "page.md"])
+    assert "S.3: mass ratios" in (tmp_path / "page.md").read_text()
