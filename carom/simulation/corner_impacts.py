@@ -32,7 +32,7 @@ ROUNDS = 3
 
 
 class CornerImpacts(NamedTuple):
-    """Impacts at one corner: velocities (m/s, rad/s) of a point of the body before and after, the corner from it (m)."""
+    """Impacts at one corner: velocities (m/s, rad/s) of a point of a body before and after, the corner from it (m)."""
 
     velocity: Float[np.ndarray, "2 K 3"]
     omega: Float[np.ndarray, "2 K 3"]
@@ -103,15 +103,16 @@ def _flight(x, rotation: Rotation, rows, time, fall):
 
 def mass_balance(poses: PoseRecording, width: float) -> MassBalance | None:
     """Centre of mass and inertia that explain the impacts at one corner best; None if there are fewer than twenty."""
-    center, unexplained = np.zeros(3), []
+    center, unexplained, count, inertia = np.zeros(3), [], 0, 0.0
     for _ in range(ROUNDS):
         impacts = corner_impacts(poses, width, center)
-        if len(impacts.arm) < FEWEST:
+        count = len(impacts.arm)
+        if count < FEWEST:
             return None
         inertia, step, before, after = _balance(impacts)
         unexplained += [before, after]
         center = center + step
-    return MassBalance(len(impacts.arm), center, inertia, (unexplained[0], unexplained[-1]))
+    return MassBalance(count, center, inertia, (unexplained[0], unexplained[-1]))
 
 
 def _balance(impacts: CornerImpacts) -> tuple[float, Float[np.ndarray, " 3"], float, float]:
