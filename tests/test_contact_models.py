@@ -345,6 +345,16 @@ def test_epsilon_is_learned_reported_and_saved(cp3, cp3_data, tmp_path):
     assert read_model_header(tmp_path / "model.carom")["compensation_steps"] is None
 
 
+@pytest.mark.slow
+def test_a_learned_epsilon_vanishes_where_contacts_do_not_yield(cp3, cp3_data):
+    """Data of CM. The paper's epsilon took its restitution with it: 0.453 for a true 0 (table S.7)."""
+    system, report = learn(cp3, cp3_data, carom.LearnConfig(contact_model="cmr", epsilon="learn"), progress=False)
+    assert report.epsilon is not None
+    assert report.epsilon < 1e-4
+    assert float(system.restitution[0]) < 1e-3
+    assert abs(float(system.friction[0]) - 0.5) < 1e-4
+
+
 # --- Choice ---------------------------------------------------------------------------------------------------------
 
 

@@ -364,14 +364,19 @@ def _within(problem: Problem) -> Problem:
     return dataclasses.replace(problem, unknowns=_with_weights(unknowns, kept - weights))
 
 
-PHYSICAL = {"log_mass_ratio": (-np.inf, np.inf), "friction": (0.0, np.inf), "restitution": (0.0, 1.0)}
+PHYSICAL = {
+    "log_mass_ratio": (-np.inf, np.inf),
+    "friction": (0.0, np.inf),
+    "restitution": (0.0, 1.0),
+    "log_epsilon": (np.log(1e-9), np.log(10.0)),
+}
 """The physical parameters, in their order in a vector, and the bounds of each."""
 
 
 def _physical(unknowns: Unknowns) -> dict[str, Float[np.ndarray, " _"]]:
     """Those that are unknown."""
     parts = {name: getattr(unknowns, name) for name in PHYSICAL}
-    return {name: np.asarray(part, float) for name, part in parts.items() if part is not None}
+    return {name: np.atleast_1d(np.asarray(part, float)) for name, part in parts.items() if part is not None}
 
 
 def _vector(unknowns: Unknowns) -> Float[np.ndarray, " p"]:
@@ -391,7 +396,8 @@ def _moved(problem: Problem, change: Float[np.ndarray, " p"]) -> Unknowns:
     """The unknowns of the problem, changed: physical parameters first, then along `features`."""
     out, first = problem.unknowns, 0
     for name, part in _physical(out).items():
-        value = jnp.asarray(part + change[first : first + len(part)], getattr(out, name).dtype)
+        old = getattr(out, name)
+        value = jnp.asarray(part + change[first : first + len(part)], old.dtype).reshape(old.shape)
         out, first = eqx.tree_at(lambda u, name=name: getattr(u, name), out, value), first + len(part)
     return out if out.potential is None else _with_weights(out, problem.features @ change[first:])
 
@@ -442,7 +448,7 @@ def whitened(seen: StepSensitivity, problem: Problem, errors, kept) -> Blocks:
             for k in range(seen.column.shape[1]):
                 dense[np.arange(steps), :, seen.column[:, k]] += getattr(seen, name)[:, :, k]
             columns.append(dense[:, :, :P])
-    jacobian = np.concatenate([*columns, seen.weights], axis=2)
+    jacobian = np.concatenate([*columns, seen.log_epsilon, seen.weights], axis=2)
     spread = seen.state * errors
     covariance = spread @ spread.transpose(0, 2, 1) + np.diag(errors**2)
     # In units of the errors, so that positions and velocities are alike in size. What rounding leaves of a step that

@@ -20,8 +20,9 @@ class StepSensitivity(NamedTuple):
     """Of one step from a recorded state, with rows for positions (m), then velocities (m/s) of all points.
 
     `residual`, predicted minus recorded; its derivatives by `log_mass_ratio`, by `friction` and `restitution` of the
-    properties `column` of the closed contacts (P, the number of properties, for unused places), by the `state` before
-    the step, and by the linear weights of a neural potential (none without one), see `force_features`.
+    properties `column` of the closed contacts (P, the number of properties, for unused places), by the logarithm of
+    CMr's epsilon if that is unknown, by the `state` before the step, and by the linear weights of a neural potential
+    (none without one), see `force_features`.
     `gap_before`, `gap`: of every contact at the recorded start and at the predicted end; `gap_slope`, derivative of the
     former by positions; `property` of each contact in the solver (P for an unused place); `jump`, how far the contacts
     changed the velocities (m/s, norm over all points); normal and tangential impulses (N s) by phase, see `Jump`.
@@ -31,6 +32,7 @@ class StepSensitivity(NamedTuple):
     log_mass_ratio: Float[Array, "R B"]
     friction: Float[Array, "R K"]
     restitution: Float[Array, "R K"]
+    log_epsilon: Float[Array, "R E"]
     state: Float[Array, "R R"]
     weights: Float[Array, "R W"]
     column: Int[Array, " K"]
@@ -100,6 +102,7 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
 
     zeros = jnp.zeros(column.shape, x.dtype)
     nothing = {"mass": masses, "friction": zeros, "restitution": zeros, "x": jnp.zeros_like(x), "v": jnp.zeros_like(x)}
+    nothing["log_epsilon"] = jnp.zeros(0 if unknowns.log_epsilon is None else 1, x.dtype)
     by_jump, jump = jax.jacfwd(touch, has_aux=True)(nothing)
     impulse = jnp.zeros((0, len(column), x.shape[1]), x.dtype) if jump.impulse is None else jump.impulse
     by_jump = {name: part.reshape(x.size, -1) for name, part in by_jump.items()}
@@ -126,6 +129,7 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
         log_mass_ratio=rows([part["mass"] for part in by_mass]) + contact_rows("mass"),
         friction=contact_rows("friction"),
         restitution=contact_rows("restitution"),
+        log_epsilon=contact_rows("log_epsilon"),
         state=jnp.concatenate([rows([part[name] for part in by_state]) for name in ("x", "v")], axis=1),
         weights=weight_rows(),
         column=column,
@@ -140,9 +144,11 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
 
 
 def _nudged(unknowns: Unknowns, nudge, skeleton: System, column: Int[Array, " K"] | None = None) -> System:
-    """The system with its masses changed a little, and friction and restitution of the properties `column`."""
+    """The system with its masses changed a little, and epsilon, friction and restitution of the properties `column`."""
     if unknowns.log_mass_ratio is not None:
         unknowns = eqx.tree_at(lambda u: u.log_mass_ratio, unknowns, unknowns.log_mass_ratio + nudge["mass"])
+    if column is not None and unknowns.log_epsilon is not None:
+        unknowns = eqx.tree_at(lambda u: u.log_epsilon, unknowns, unknowns.log_epsilon + nudge["log_epsilon"][0])
     system = unknowns.assemble(skeleton)
     if column is None:
         return system
