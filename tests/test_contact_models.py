@@ -124,6 +124,8 @@ def test_cmr_of_one_contact_in_closed_form():
 # --- Coulomb --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_coulomb_obeys_the_law_and_cm_lifts_what_slides():
     """Compression (e = 0): gaps close or no force, and friction of mu f_n against the sliding, within the cone."""
     rng = np.random.default_rng(5)
@@ -163,6 +165,8 @@ def one_contact(speed, sliding, friction, restitution):
     )
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_one_sliding_contact_by_hand():
     """Poisson: the impulse is (1 + e) u_n, and friction mu of it; CM's is larger by what it lifts."""
     state = one_contact(1.0, 2.0, 0.3, 0.5)
@@ -171,6 +175,8 @@ def test_one_sliding_contact_by_hand():
     assert impulses(carom.CM(), state)[0, 0, 0] > 1.8
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_fast_impacts_have_less_friction_and_restitution():
     e, mu, speed, losses, pace = 0.8, 0.3, 0.4, (0.3, 0.5), 0.25
     lost = 1 - np.exp(-speed / pace)

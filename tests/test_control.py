@@ -33,7 +33,6 @@ def test_bounce_once_by_hand():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_the_spin_that_sends_a_disk_straight_up_by_hand():
     """The disk sticks: a third of the speed at which it touches, `v_x + r w`, is taken off v_x. So `r w = 2 v_x`."""
     problem, _, report = solved("throw-vertical")
