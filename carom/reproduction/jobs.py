@@ -57,7 +57,7 @@ class Job:
         return "-".join([*parts, f"seed{self.seed}"])
 
     def config(self) -> LearnConfig:
-        """How it is learned: the defaults, and chunks of more states where these are noisy."""
+        """How it is learned: the defaults; a baseline for as long as in `benchmarks.baselines`."""
         return LearnConfig(
             model=self.model,
             contact_model=self.contact_model,
