@@ -114,7 +114,8 @@ def _read(path: Path) -> list[np.ndarray]:
                 if match and file is not None:
                     tensors[int(match[1])] = tensor_of(file.read(), member.name)
     except (tarfile.TarError, EOFError, OSError) as error:
-        raise CaromError(f"the archive {path} cannot be read ({error}). Fetch it again.") from None
+        why = str(error).splitlines()[0].rstrip(":")
+        raise CaromError(f"the archive {path} cannot be read ({why}). Fetch it again.") from None
     return [tensors[k] for k in sorted(tensors)]
 
 
