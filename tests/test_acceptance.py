@@ -7,6 +7,7 @@ import pytest
 import carom
 from carom.learning.dataset import Dataset
 from carom.learning.evaluate import evaluate
+from carom.learning.identify import identify
 from carom.learning.models import mass_ratios
 from carom.learning.train import learn
 from carom.tasks import make_data_sets
@@ -47,6 +48,32 @@ def test_elastic_tasks_and_the_hamiltonian_network(task, model):
     truth, dataset, _ = full_dataset(task)
     system, _ = learn(truth, dataset, carom.LearnConfig(model=model), progress=False)
     check_learned(system, truth)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("task", ["gyro", "gyro-e"])
+def test_gyroscopes_are_learned(task):
+    truth, dataset, _ = full_dataset(task)
+    system, _ = learn(truth, dataset, progress=False)
+    check_learned(system, truth, properties=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_disks_are_learned_as_far_as_the_data_tell():
+    """Some of the 30 pairs hardly meet; what is called identified must be right, and most of it is."""
+    truth, dataset, _ = full_dataset("bd5")
+    system, _ = learn(truth, dataset, progress=False)
+    assert np.abs(mass_ratios(system) / mass_ratios(truth) - 1).max() < 5e-3
+    found = identify(system, dataset.train, learned=("mass", "friction", "restitution", "potential"))
+    right = 0
+    for name in ("friction", "restitution"):
+        for k, estimate in enumerate(getattr(found, name)):
+            if estimate.verdict == "identified":
+                assert abs(estimate.value - float(getattr(truth, name)[k])) < 2e-2
+                right += 1
+    assert right >= 30
 
 
 @pytest.mark.slow
