@@ -244,7 +244,6 @@ def test_two_balls():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_geometry_and_impacts_at_the_same_time():
     """Elastic, no gravity: `y = v T - y_0 + 2 r + 2 h` over a floor at h, for each of two balls that land together."""
 
