@@ -85,27 +85,26 @@ class Reproduce:
             + (f", about {minutes:.0f} minutes" if todo and not self.quick else ""),
             highlight=False,
         )
-        reports: dict[Job, Any] = {}
+        # Finished trainings that are not asked for now stay in the table.
+        finished = [job for job in every if job not in todo and (folder / job.name / "report.json").exists()]
+        reports: dict[Job, Any] = {job: job.run(folder, quick=self.quick) for job in finished}
+
+        def write() -> Path:
+            content = results.collect(wanted, reports, seeds=seeds, quick=self.quick)
+            return results.write(content, self.results / "quick" if self.quick else self.results)
 
         def keep(job: Job, report: dict[str, Any]) -> None:
             reports[job] = report
-            content = results.collect(wanted, reports, seeds=seeds, quick=self.quick)
-            results.write(content, self.results / "quick" if self.quick else self.results)
+            write()
 
-        # Finished trainings that are not asked for now stay in the table.
-        for job in [job for job in every if job in jobs or (folder / job.name / "report.json").exists()]:
-            if job not in todo:
-                keep(job, job.run(folder, quick=self.quick))
         if self.workers == 1:
             for job in todo:
                 keep(job, job.run(folder, quick=self.quick, say=lambda text: console.print(text, highlight=False)))
         else:
             self._parallel(todo, folder, keep, console)
-        if not every:
-            results.write(results.collect(wanted, {}, seeds=seeds, quick=self.quick), self.results)
+        path = write().with_suffix(".md")
         if self.quick:
             console.print("A smoke run: the numbers mean nothing.")
-        path = (self.results / "quick" if self.quick else self.results) / f"{name}.md"
         console.print(f"Written to {path}", soft_wrap=True, highlight=False)
 
     def _parallel(self, todo, folder: Path, keep, console: Console) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 import carom
 from carom.checks import require
-from carom.learning.config import FORMULATIONS, LearnConfig, Model
+from carom.learning.config import BASELINES, FORMULATIONS, LearnConfig, Model
 from carom.learning.dataset import Dataset
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
@@ -65,7 +65,7 @@ class Job:
             width=self.width,
             depth=self.depth,
             seed=self.seed,
-            epochs=250 if self.model in ("mlp-cd-clnn", "in-cp-clnn", "in-cp-sp") else LearnConfig.epochs,
+            epochs=250 if self.model in BASELINES else LearnConfig.epochs,
         )
 
     def settings(self, quick: bool) -> dict[str, Any]:
@@ -80,9 +80,7 @@ class Job:
     def _quickened(self) -> LearnConfig:
         return dataclasses.replace(self.config(), epochs=4)
 
-    def run(
-        self, folder: Path, *, quick: bool = False, say: Callable[[str], None] = lambda text: None
-    ) -> dict[str, Any]:
+    def run(self, folder: Path, *, quick: bool = False, say: Callable[[str], None] | None = None) -> dict[str, Any]:
         """Learn and measure, or go on where a training was stopped, or read what was measured.
 
         **Raises:** `CaromError` if the folder holds a training with other settings.

@@ -67,7 +67,7 @@ def measured(cell: Cell, values: list[float | None]) -> dict[str, Any]:
 
 
 def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, quick: bool) -> dict[str, Any]:
-    """All cells of a table of which every seed has a report, with where they come from."""
+    """All cells of a table, by the seeds that have a report, with where they come from."""
     cells = []
     for cell in table.cells:
         if cell.job is None:

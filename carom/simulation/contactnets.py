@@ -126,10 +126,10 @@ def tensor_of(data: bytes, name: str) -> Float[np.ndarray, "T 19"]:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as parts:
-            names = {part.rsplit("/", 2)[-1] if part.endswith(".pkl") else part: part for part in parts.namelist()}
-            storages = [part for part in names.values() if re.search(r"/data/\d+$", part)]
-            require(len(storages) == 1 and "data.pkl" in names, f"{name} does not hold one tensor.")
-            about, raw = parts.read(names["data.pkl"]), parts.read(storages[0])
+            storages = [part for part in parts.namelist() if re.search(r"/data/\d+$", part)]
+            pickles = [part for part in parts.namelist() if part.endswith("/data.pkl")]
+            require(len(storages) == len(pickles) == 1, f"{name} does not hold one tensor.")
+            about, raw = parts.read(pickles[0]), parts.read(storages[0])
     except (zipfile.BadZipFile, EOFError) as error:
         raise CaromError(f"{name} is not an archive of torch.save ({error}).") from None
     kinds = [dtype for storage, dtype in STORAGES.items() if storage in about]
