@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from carom.atomic import replacing, write_whole
 from carom.checks import require
 from carom.errors import CaromError
+from carom.simulation.pose_checks import earlier_equal
 
 URL = "https://github.com/DAIRLab/contact-nets/archive/c3dc21c.tar.gz"
 TOSSES, SAMPLES = 570, 59953
@@ -80,7 +81,10 @@ def convert(archive: str | os.PathLike[str], out: str | os.PathLike[str], *, sha
     )
     rows = np.concatenate(tosses)
     offsets = np.cumsum([0, *map(len, tosses)])
-    groups, copies = sessions(np.array([toss[0, 7:9] for toss in tosses])), copies_of(tosses)
+    groups, copies = (
+        sessions(np.array([toss[0, 7:9] for toss in tosses])),
+        np.array(earlier_equal((toss[:, 2] for toss in tosses), 5)),
+    )
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -150,13 +154,3 @@ def sessions(velocity: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, " N"]:
     heading = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0]))
     turn = np.abs((np.diff(heading) + 180) % 360 - 180)
     return np.concatenate([[0], np.cumsum(turn > SESSION_TURN)])
-
-
-def copies_of(tosses: list[np.ndarray]) -> Int[np.ndarray, " N"]:
-    """For each toss, which earlier one has the same heights (it is that one, turned about the vertical), or -1."""
-    seen: dict[bytes, int] = {}
-    out = []
-    for k, toss in enumerate(tosses):
-        first = seen.setdefault(np.round(toss[:, 2], 5).tobytes(), k)
-        out.append(first if first != k else -1)
-    return np.array(out)

@@ -1,5 +1,6 @@
 """What looks wrong with a recording of poses: scale, gravity, penetration, bias, copies, late velocities."""
 
+from collections.abc import Iterable
 from itertools import product
 from typing import NamedTuple
 
@@ -111,15 +112,15 @@ def _mass(poses: PoseRecording, width: float) -> Finding:
 
 def find_copies(poses: PoseRecording) -> list[tuple[int, int]]:
     """Pairs of trajectories with the same heights at all samples (to 1e-7 m): one is the other, turned or moved."""
+    heights = (poses.position[k, :length, 2] for k, length in enumerate(poses.length))
+    return [(first, k) for k, first in enumerate(earlier_equal(heights, 7)) if first >= 0]
+
+
+def earlier_equal(heights: Iterable[np.ndarray], digits: int) -> list[int]:
+    """For each array the index of the first one before it that is the same to so many digits, or -1."""
     seen: dict[bytes, int] = {}
-    out = []
-    for k, length in enumerate(poses.length):
-        key = np.round(poses.position[k, :length, 2], 7).tobytes()
-        if key in seen:
-            out.append((seen[key], k))
-        else:
-            seen[key] = k
-    return out
+    firsts = [seen.setdefault(np.round(each, digits).tobytes(), k) for k, each in enumerate(heights)]
+    return [first if first != k else -1 for k, first in enumerate(firsts)]
 
 
 def flight_noise(poses: PoseRecording) -> float:
