@@ -24,8 +24,9 @@ from carom.learning.baselines import (
 )
 from carom.learning.baselines.graph import WORLD, Graph
 from carom.learning.dataset import Chunks, Dataset
+from carom.learning.loss import train_step
 from carom.learning.optimizer import Rates
-from carom.learning.train import fresh_state, learn, train_step
+from carom.learning.train import fresh_state, learn
 from carom.simulation.impact import Stepper, contact_jump
 from carom.simulation.rollout import step
 

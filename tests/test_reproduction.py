@@ -11,7 +11,7 @@ from systems import refused
 import carom
 from carom.cli.main import main
 from carom.reproduction.jobs import Job
-from carom.reproduction.results import collect, markdown, measured, page, write
+from carom.reproduction.results import collect, markdown, measured, page, pictures, write
 from carom.reproduction.tables import BUILDERS, Cell, paper, table
 from carom.tasks import noisy
 from carom.tasks.pendulums import chain_angles, chain_state
@@ -22,7 +22,18 @@ def report_of(cell: Cell, value: float) -> dict:
     filled = {"friction": [value] * 40, "restitution": [value] * 40, "mass_ratio": [value] * 12}
     provenance = {"digest": "x", "seconds": 60.0, "carom": "0", "jax": "0"}
     errors = {name: {"trajectory_error": value} for name in ("cm", "lcp")}
-    return {"learned": filled, "evaluation": errors, "provenance": provenance}
+    curve = {name: {"mean": [0.0, value], "ci95": [0.0, value / 2], "median": [0.0, value]} for name in CURVES}
+    told = {name: [{"standard_error": value / 10}] * 40 for name in ("friction", "restitution")}
+    return {
+        "learned": filled,
+        "evaluation": errors,
+        "over_time": {"cm": curve, "lcp": curve},
+        "identification": told,
+        "provenance": provenance,
+    }
+
+
+CURVES = ("state", "energy")
 
 
 PRINTED = {"s1": 16, "s2": 16, "s3": 16, "s4": 16, "s5": 12, "s6": 12, "s7": 16, "s8": 2, "s9": 40, "s10": 12}
@@ -31,7 +42,8 @@ PRINTED = {"s1": 16, "s2": 16, "s3": 16, "s4": 16, "s5": 12, "s6": 12, "s7": 16,
 @pytest.mark.parametrize("name", BUILDERS)
 def test_every_printed_number_has_a_cell(name):
     wanted = table(name)
-    assert sum(cell.paper is not None for cell in wanted.cells) == PRINTED.get(name, 0)
+    printed = [cell for cell in wanted.cells if cell.paper is not None and "learned with" not in cell.row]
+    assert len(printed) == PRINTED.get(name, 0)
     assert len({(cell.row, cell.column) for cell in wanted.cells}) == len(wanted.cells)
     for cell in wanted.cells:
         assert (cell.job is None) <= (cell.note != "")
@@ -104,6 +116,38 @@ def test_tables_are_written_with_what_is_there(tmp_path):
     whole = page(tmp_path / "results")
     assert "Of 2 cells that can be compared 1 are" in whole
     assert text in whole
+
+
+def test_other_readings_are_shown_but_do_not_count():
+    wanted = table("s4")
+    jobs = wanted.jobs(1)
+    content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=1, quick=False)
+    assert content["summary"]["compared"] == 16
+    assert len(content["cells"]) == 24
+    assert "| (better) |" in markdown(content)
+    models = {job.contact_model for job in jobs if job.data == "lcp" and job.task == "cp3"}
+    assert models == {"cm", "coulomb", "lcp"}
+    assert {job.contact_model for job in jobs if job.task == "cp3-e"} == {"cm"}
+
+
+def test_standard_errors_and_pictures(tmp_path):
+    wanted = table("properties")
+    jobs = wanted.jobs(1)[:1]
+    content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=1, quick=False)
+    assert content["cells"][0]["standard_error"] == pytest.approx(0.05)
+    assert "| standard error |" in markdown(content)
+    wanted = table("figure3")
+    jobs = [job for job in wanted.jobs(2) if job.task in ("cp3", "gyro")]
+    content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=2, quick=False)
+    (first,) = [c for c in content["over_time"] if (c["row"], c["column"]) == ("CM-CD-CLNN", "cp3")]
+    assert first["state"]["mean"] == [0.0, 0.5]
+    assert first["energy"]["ci95"][1] == pytest.approx(0.25 / np.sqrt(2), rel=1e-3)
+    assert len(content["over_time"]) == 14
+    write(content, tmp_path)
+    drawn = pictures(tmp_path, tmp_path / "images")
+    assert [path.name for path in drawn] == ["errors_over_time.png", "energy_over_time.png"]
+    assert all(path.stat().st_size > 10_000 for path in drawn)
+    assert "images/energy_over_time.png" in page(tmp_path)
 
 
 def test_noise_of_pendulums_is_on_angles_and_rates():

@@ -26,7 +26,7 @@ from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
-from carom.tasks import make_data_sets, task
+from carom.tasks import make_data_sets, noisy, task
 
 TEST_DATA = "test.h5"
 QUICK = {"trajectories": 100, "epochs": 20}
@@ -56,6 +56,8 @@ class Learn:
     """Training trajectories to simulate (and an eighth as many each to validate and to test)."""
     data_contact_model: ContactModelName = "cm"
     """Contact model of the simulated data; `--contact-model` is the one to learn with."""
+    data_noise: float = 0.0
+    """Standard deviation of errors put on simulated data to learn from (rad and rad/s for pendulums, else m and m/s)."""
     quick: bool = False
     """A small training of one minute or so after compilation, to try things out: few trajectories and epochs."""
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
@@ -82,6 +84,14 @@ class Learn:
         self.config.check()
         self.config.prepare(truth)
         contact_model_of(self.data_contact_model, argument="data_contact_model")
+        require(
+            0 <= self.data_noise < np.inf,
+            f"data_noise must be a finite number of at least 0; it was {self.data_noise}.",
+        )
+        require(
+            self.data is None or not self.data_noise,
+            f"data_noise is for simulated data; it was {self.data_noise}, and data {str(self.data)!r}.",
+        )
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
         if self.data is not None and can_learn_tosses(truth):
             self._run_tosses(console, truth)
@@ -163,6 +173,9 @@ class Learn:
                 contact_model=self.data_contact_model,
                 compensation_steps=self.config.compensation_steps,
             )
+            if self.data_noise:
+                rng = np.random.default_rng((self.config.seed, 17))
+                train, val = (noisy(self.task, part, self.data_noise, rng) for part in (train, val))
             return Dataset(train, val), test
         data = load_recording(self.data, task=self.task)
         test = load_recording(self.test, task=self.task) if self.test else None
@@ -191,6 +204,12 @@ class Learn:
         if found is not None:
             console.print(told_table(system, found))
         console.print(evaluation_table(measures))
+        if report.starts_estimated:
+            console.print(
+                "The data are noisier than a tenth of what a step moves: start states were estimated too "
+                "(docs/noise.md).",
+                highlight=False,
+            )
         if report.skipped_steps or report.overflowed_contacts:
             console.print(
                 f"Note: {report.skipped_steps} steps were left out because a gradient was not finite; "

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from carom.checks import require
 
-Choice = Literal["s1", "s2", "s3", "s4", "s5", "s6", "s7", "s8", "s9", "s10", "properties", "all", "page"]
+Choice = Literal["s1", "s2", "s3", "s4", "s5", "s6", "s7", "s8", "s9", "s10", "properties", "figure3", "all", "page"]
 MINUTES = {"bp5-e": 1.5, "bp5": 1.5, "bd5": 4, "cp3-e": 0.7, "cp3": 0.7, "gyro-e": 1, "gyro": 1.2, "rope": 2}
 """What a training takes on two cores, about; other tasks longer."""
 
@@ -20,7 +20,8 @@ MINUTES = {"bp5-e": 1.5, "bp5": 1.5, "bd5": 4, "cp3-e": 0.7, "cp3": 0.7, "gyro-e
 class Reproduce:
     """Learn what a table of the paper's supplement needs, measure it, and write results/TABLE.json and TABLE.md.
 
-    Finished trainings are skipped, stopped ones go on. `all`: every table; `page`: docs/results.md from what there is.
+    Finished trainings are skipped, stopped ones go on. `all`: every table; `page`: docs/results.md from what there is,
+    and the pictures of figure3.
     """
 
     table: Annotated[
@@ -59,6 +60,8 @@ class Reproduce:
             check_writable(self.page)
             write_whole(self.page, results.page(self.results).encode())
             console.print(f"Written to {self.page}", soft_wrap=True, highlight=False)
+            for path in results.pictures(self.results, self.page.parent / "images"):
+                console.print(f"Drawn: {path}", soft_wrap=True, highlight=False)
             return
         for name in BUILDERS if self.table == "all" else [self.table]:
             self._one(name, console)

@@ -61,6 +61,27 @@ def state_errors(
     return np.where(lost, np.inf, distance / size), np.where(lost, 1.0, bounded)
 
 
+def energy_errors(recording: Recording, predicted: Trajectory, truth: System) -> Float[np.ndarray, "N T"]:
+    """Error of the energy of each predicted state: `|E^ - E|` by the true system, over its largest kinetic energy.
+
+    That of the trajectory is meant; the zero of a potential says nothing. NaN after a trajectory's own end.
+    """
+    x, v = jnp.asarray(recording.x), jnp.asarray(recording.v)
+    true, guess = np.asarray(truth.energy(x, v)), np.asarray(truth.energy(predicted.x, predicted.v))
+    kinetic = 0.5 * np.einsum("tkid,ij,tkjd->tk", recording.v, np.asarray(truth.mass_matrix()), recording.v)
+    largest = np.max(np.where(recording.valid, kinetic, 0), axis=1, keepdims=True)
+    error = np.where(np.isfinite(guess), np.abs(guess - true), np.inf) / np.maximum(largest, 1e-300)
+    return np.where(recording.valid, error, np.nan)
+
+
+def mean_and_interval(errors: Float[np.ndarray, "N T"]) -> dict[str, list[float]]:
+    """At each time, the mean over trajectories (those that last so long), and half of its 95 % interval."""
+    count = np.maximum(np.sum(~np.isnan(errors), axis=0), 1)
+    mean = np.nanmean(errors, axis=0)
+    spread = 1.96 * np.nanstd(errors, axis=0, ddof=1) / np.sqrt(count) if len(errors) > 1 else np.zeros_like(mean)
+    return {"mean": mean.tolist(), "ci95": spread.tolist(), "median": np.nanmedian(errors, axis=0).tolist()}
+
+
 def evaluate(
     system: System,
     recording: Recording,

@@ -12,6 +12,9 @@ Steps in which a gap, before or after, is closed or open by less than `doubt` st
 there errors decide which contacts act. What is left is minimised by the robust
 estimator of `robust.py`, from the learned values on, clustered by trajectory.
 
+Where states are noisier than a tenth of what a step moves, few steps are beyond doubt. Then windows of many states are
+looked at, whose start states are estimated too (`shooting.py`), and standard errors are those of that estimator.
+
 A neural potential is profiled out: the weights in which it is linear are estimated along with the physical parameters
 (along the principal directions of the forces they can make), so that standard errors hold what masses and forces can
 trade; its other layers are held. The values reported (`refined`) are this estimator's.
@@ -33,9 +36,17 @@ from jaxtyping import Bool, Float
 from carom.checks import require
 from carom.learning.dataset import closing
 from carom.learning.models import Unknowns
-from carom.learning.refine import MOST_POINTS, SMALLEST_ERROR, IdentifyConfig, new_problem, refine, unknowns_of
-from carom.learning.robust import Solution
+from carom.learning.parameters import unknowns_of
+from carom.learning.refine import (
+    MOST_POINTS,
+    SMALLEST_ERROR,
+    IdentifyConfig,
+    new_problem,
+    refine,
+    sensitivities,
+)
 from carom.learning.sensitivity import StepSensitivity
+from carom.learning.shooting import shoot, shooting_of
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.files import Recording
 from carom.simulation.impact import COMPENSATION_STEPS, Stepper
@@ -115,17 +126,25 @@ def identify(
     )
     unknowns = unknowns_of(system, learned)
     impacts = closing(recording, system)
-    problem = new_problem(unknowns, system, stepper, recording, config)
-    require(len(problem.steps) > 0, "the recording has no step that starts without contact.")
-    fitted, solution, seen = refine(problem, config)
-    contact = count_contacts(system.n_properties, seen, solution.weight)
+    shooting = shooting_of(unknowns, system, stepper, recording, seed=config.seed)
+    if shooting is not None:
+        fitted, errors = shoot(shooting, unknowns)
+        problem = new_problem(fitted, system, stepper, shooting.states(), config)
+        seen = sensitivities(problem, fitted)
+        weight = np.ones(len(problem.steps))
+    else:
+        problem = new_problem(unknowns, system, stepper, recording, config)
+        require(len(problem.steps) > 0, "the recording has no step that starts without contact.")
+        fitted, solution, seen = refine(problem, config)
+        errors, weight = solution.standard_error, solution.weight
+    contact = count_contacts(system.n_properties, seen, weight)
     return Identification(
         impacts=impacts.tolist(),
         **{name: contact[name].tolist() for name in ("used", "sliding", "sticking")},
-        friction=_friction(fitted, solution, contact, config),
-        restitution=_restitution(fitted, solution, contact, config),
-        mass_ratio=_mass_ratios(fitted, solution, config),
-        steps=len(solution.weight),
+        friction=_friction(fitted, errors, contact, config),
+        restitution=_restitution(fitted, errors, contact, config),
+        mass_ratio=_mass_ratios(fitted, errors, config),
+        steps=len(weight),
     )
 
 
@@ -177,7 +196,7 @@ def _depends(derivative: Float[np.ndarray, "S R K"], seen: StepSensitivity, P: i
     return by_property[rows, seen.property]
 
 
-def _estimates(fitted: Unknowns, solution: Solution, name: str):
+def _estimates(fitted: Unknowns, errors: Float[np.ndarray, " p"], name: str):
     """Value and standard error of each parameter of one kind."""
     value, first = getattr(fitted, name), 0
     for other in ("log_mass_ratio", "friction", "restitution"):
@@ -187,12 +206,12 @@ def _estimates(fitted: Unknowns, solution: Solution, name: str):
     if value is None:
         return
     for k, number in enumerate(np.asarray(value, float)):
-        yield k, number, max(float(solution.standard_error[first + k]), SMALLEST_ERROR)
+        yield k, number, max(float(errors[first + k]), SMALLEST_ERROR)
 
 
-def _friction(fitted, solution, contact, config: IdentifyConfig) -> list[Estimate]:
+def _friction(fitted, errors, contact, config: IdentifyConfig) -> list[Estimate]:
     out = []
-    for k, value, error in _estimates(fitted, solution, "friction"):
+    for k, value, error in _estimates(fitted, errors, "friction"):
         sliding, sticking, held = (contact[n][k] for n in ("sliding", "sticking", "held"))
         told = sliding >= config.min_impacts and error <= config.max_standard_error
         bounded = not told and sticking >= config.min_impacts and held > 0
@@ -205,9 +224,9 @@ def _friction(fitted, solution, contact, config: IdentifyConfig) -> list[Estimat
     return out
 
 
-def _restitution(fitted, solution, contact, config: IdentifyConfig) -> list[Estimate]:
+def _restitution(fitted, errors, contact, config: IdentifyConfig) -> list[Estimate]:
     out = []
-    for k, value, error in _estimates(fitted, solution, "restitution"):
+    for k, value, error in _estimates(fitted, errors, "restitution"):
         felt, unfelt, allowed = (contact[n][k] for n in ("felt", "unfelt", "allowed"))
         told = felt >= config.min_impacts and error <= config.max_standard_error
         bounded = not told and unfelt >= config.min_impacts and allowed < 1
@@ -221,9 +240,9 @@ def _restitution(fitted, solution, contact, config: IdentifyConfig) -> list[Esti
     return out
 
 
-def _mass_ratios(fitted, solution, config: IdentifyConfig) -> list[Estimate]:
+def _mass_ratios(fitted, errors, config: IdentifyConfig) -> list[Estimate]:
     out = []
-    for _, value, error in _estimates(fitted, solution, "log_mass_ratio"):
+    for _, value, error in _estimates(fitted, errors, "log_mass_ratio"):
         ratio, half = np.exp(value), 1.96 * error
         told = error <= config.max_standard_error
         out.append(

@@ -6,7 +6,7 @@ straight to where the gradient steps of a training, which take one after the oth
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from carom.learning.dataset import all_gaps
 from carom.learning.models import NeuralPotential, Unknowns
+from carom.learning.parameters import at_bounds, bounds, linear_weights, moved, physical_vector, ridge, with_weights
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.sensitivity import StepSensitivity, force_features, step_sensitivity
 from carom.mechanics.dynamics import saddle_point
@@ -59,17 +60,6 @@ class IdentifyConfig:
     Otherwise steps that do not fit have less weight only, and errors are those left by the last round."""
     seed: int = 0
     """Which steps are used where there are more."""
-
-
-def unknowns_of(system: System, learned: Sequence[str]) -> Unknowns:
-    """The values of a learned system as `Unknowns`."""
-    potential = system.potential if isinstance(system.potential, NeuralPotential) else None
-    return Unknowns(
-        log_mass_ratio=jnp.log(system.masses[1:] / system.masses[0]) if "mass" in learned else None,
-        friction=system.friction if "friction" in learned else None,
-        restitution=system.restitution if "restitution" in learned else None,
-        potential=potential if "potential" in learned else None,
-    )
 
 
 # --- which steps --------------------------------------------------------------------------------------------------
@@ -192,7 +182,7 @@ class Refined(NamedTuple):
 
 def refinements(problem: Problem, config: IdentifyConfig) -> Iterator[Refined]:
     """One Gauss-Newton step after another, from `problem.unknowns` towards what fits the steps best; without end."""
-    unknowns, count = problem.unknowns, len(_vector(problem.unknowns))
+    unknowns, count = problem.unknowns, len(physical_vector(problem.unknowns))
 
     directions = problem.features.shape[1]
 
@@ -201,23 +191,23 @@ def refinements(problem: Problem, config: IdentifyConfig) -> Iterator[Refined]:
 
     # A prior of standard deviation 1 on all physical parameters, which says nothing where data speak; and towards no
     # network, where a uniform field and the energy of segments explain the data as well.
-    weights, ridge = _linear_weights(unknowns), _ridge(unknowns)
+    weights, stiff = linear_weights(unknowns), ridge(unknowns)
     prior = np.eye(count + directions)
-    prior[count:, count:] = problem.features.T @ (ridge[:, None] * problem.features)
+    prior[count:, count:] = problem.features.T @ (stiff[:, None] * problem.features)
     most = whole(np.full(count, MOST_CHANGE), np.inf)
-    lower, upper = (whole(end, rest) for end, rest in zip(_bounds(unknowns), (-np.inf, np.inf), strict=True))
+    lower, upper = (whole(end, rest) for end, rest in zip(bounds(unknowns), (-np.inf, np.inf), strict=True))
     changed = np.zeros(len(prior))
     seen = sensitivities(problem, unknowns)
-    errors = error_sizes(seen, problem.recording)
+    errors = _errors(seen, problem.recording)
     kept = beyond_doubt(seen, errors, config.doubt)
     for k in itertools.count():
         kept = kept & _finite(seen)
         seen = _those(seen, kept)
-        now = whole(_vector(unknowns), 0.0)
+        now = whole(physical_vector(unknowns), 0.0)
         pull = prior @ changed
         if not config.redescend:
             pull[:count] = 0  # what is blind here need not have been where the first step began
-        pull[count:] += problem.features.T @ (ridge * weights)
+        pull[count:] += problem.features.T @ (stiff * weights)
         solution = solve(
             whitened(seen, problem, errors, kept),
             prior,
@@ -227,17 +217,17 @@ def refinements(problem: Problem, config: IdentifyConfig) -> Iterator[Refined]:
             redescend=config.redescend and k > 0,
         )
         changed = changed + solution.change
-        unknowns = _moved(problem, changed)
+        unknowns = moved(problem.unknowns, problem.features, changed)
         yield Refined(unknowns, solution, seen)
         seen = sensitivities(problem, unknowns)
         if not config.redescend:
-            errors = error_sizes(seen, problem.recording)
+            errors = _errors(seen, problem.recording)
             kept = beyond_doubt(seen, errors, config.doubt)
 
 
 def refine(problem: Problem, config: IdentifyConfig) -> Refined:
     """The parameters that fit the steps best: Gauss-Newton steps until these move by little of their errors."""
-    count = len(_vector(problem.unknowns))
+    count = len(physical_vector(problem.unknowns))
     for k, refined in enumerate(refinements(problem, config), 1):
         if k == config.rounds or (k > 1 and _settled(refined.solution, count)):
             return refined
@@ -255,8 +245,6 @@ PATIENCE = 3
 """So many steps may pass until the loss is half of what it was; else the last step is made."""
 STILL = 1e-4
 """A step that moves physical parameters by less is the last one: rare contacts hardly show in the typical error."""
-AT_BOUND = 0.02
-"""Frictions and restitutions so near to a bound, which data seldom tell apart from it, are tried there."""
 
 
 def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
@@ -266,7 +254,7 @@ def can_be_refined(unknowns: Unknowns, skeleton: System) -> bool:
     precision, which rounding leaves too little of one step's error, and where nothing physical or neural is unknown.
     """
     networks = unknowns.contact_model is not None or unknowns.step_model is not None
-    nothing = unknowns.potential is None and not _physical(unknowns)
+    nothing = unknowns.potential is None and not len(physical_vector(unknowns))
     double = skeleton.friction.dtype == jnp.float64
     return double and skeleton.n_points <= MOST_POINTS and not (networks or nothing)
 
@@ -298,7 +286,7 @@ def polish(
     if not len(problem.steps):
         return best, fit
     errors: list[float] = []
-    count = len(_vector(unknowns))
+    count = len(physical_vector(unknowns))
     for refined in itertools.islice(refinements(_within(problem), POLISH), POLISH.rounds):
         now = judge(refined.unknowns)
         if now.mean < fit.mean:
@@ -308,21 +296,9 @@ def polish(
         moved = np.abs(refined.solution.change[:count]).max(initial=0.0)
         if slow or (now.typical <= enough and moved < STILL):
             break
-    there = _at_bounds(best)
+    there = at_bounds(best)
     now = judge(there)
     return (there, now) if now.mean < fit.mean else (best, fit)
-
-
-def _at_bounds(unknowns: Unknowns) -> Unknowns:
-    """Frictions and restitutions moved onto a bound that is near."""
-    for name in ("friction", "restitution"):
-        lower, upper = PHYSICAL[name]
-        value = getattr(unknowns, name)
-        if value is not None:
-            value = jnp.select([value < lower + AT_BOUND, value > upper - AT_BOUND], [lower, upper], value)
-            value = jnp.asarray(value, getattr(unknowns, name).dtype)
-            unknowns = eqx.tree_at(lambda u, name=name: getattr(u, name), unknowns, value)
-    return unknowns
 
 
 def _those(seen: StepSensitivity, kept: Bool[np.ndarray, " S"]) -> StepSensitivity:
@@ -334,95 +310,32 @@ def _settled(solution: Solution, count: int) -> bool:
     return bool(np.all(np.abs(solution.change[:count]) < 0.02 * errors))
 
 
-def _linear_weights(unknowns: Unknowns) -> Float[np.ndarray, " W"]:
-    """All weights in which the potential is linear; none without one."""
-    parts = () if unknowns.potential is None else unknowns.potential.linear_weights()
-    return np.concatenate([np.zeros(0), *(np.asarray(w, float).ravel() for w in parts)])
-
-
-_FREE = 1e-6
-"""Precision of the weights that are no network's, as a share of those that are."""
-
-
-def _ridge(unknowns: Unknowns) -> Float[np.ndarray, " W"]:
-    """Precision of the weights that are profiled out: those of the network are of the size that they begin with."""
-    if unknowns.potential is None:
-        return np.zeros(0)
-    sizes = [w.size for w in unknowns.potential.linear_weights()]
-    output = 0 if unknowns.potential.network is None else sizes[0]
-    share = np.where(np.arange(sum(sizes)) < output, 1.0, _FREE)
-    return 3 * max(output, 1) * share  # uniform within +-1 / sqrt(output)
-
-
 def _within(problem: Problem) -> Problem:
     """The problem without the part of the weights that makes no force on the data to speak of: it would elsewhere."""
     unknowns, features = problem.unknowns, problem.features
     if unknowns.potential is None or features.shape[1] == POLISH.directions:
         return problem
-    weights = _linear_weights(unknowns)
+    weights = linear_weights(unknowns)
     kept = features @ (features.T @ weights)
-    return dataclasses.replace(problem, unknowns=_with_weights(unknowns, kept - weights))
+    return dataclasses.replace(problem, unknowns=with_weights(unknowns, kept - weights))
 
 
-PHYSICAL = {
-    "log_mass_ratio": (-np.inf, np.inf),
-    "friction": (0.0, np.inf),
-    "restitution": (0.0, 1.0),
-    "log_epsilon": (np.log(1e-9), np.log(10.0)),
-}
-"""The physical parameters, in their order in a vector, and the bounds of each."""
-
-
-def _physical(unknowns: Unknowns) -> dict[str, Float[np.ndarray, " _"]]:
-    """Those that are unknown."""
-    parts = {name: getattr(unknowns, name) for name in PHYSICAL}
-    return {name: np.atleast_1d(np.asarray(part, float)) for name, part in parts.items() if part is not None}
-
-
-def _vector(unknowns: Unknowns) -> Float[np.ndarray, " p"]:
-    return np.concatenate([np.zeros(0), *_physical(unknowns).values()])
-
-
-def _bounds(unknowns: Unknowns) -> list[Float[np.ndarray, " p"]]:
-    """Lower and upper bounds of the physical parameters."""
-    sizes = {name: len(part) for name, part in _physical(unknowns).items()}
-    return [
-        np.concatenate([np.zeros(0), *(np.full(size, PHYSICAL[name][k]) for name, size in sizes.items())])
-        for k in range(2)
-    ]
-
-
-def _moved(problem: Problem, change: Float[np.ndarray, " p"]) -> Unknowns:
-    """The unknowns of the problem, changed: physical parameters first, then along `features`."""
-    out, first = problem.unknowns, 0
-    for name, part in _physical(out).items():
-        old = getattr(out, name)
-        value = jnp.asarray(part + change[first : first + len(part)], old.dtype).reshape(old.shape)
-        out, first = eqx.tree_at(lambda u, name=name: getattr(u, name), out, value), first + len(part)
-    return out if out.potential is None else _with_weights(out, problem.features @ change[first:])
-
-
-def _with_weights(unknowns: Unknowns, change: Float[np.ndarray, " W"]) -> Unknowns:
-    """The unknowns with the potential's linear weights changed."""
-    assert unknowns.potential is not None
-    old = unknowns.potential.linear_weights()
-    by = np.split(change, np.cumsum([w.size for w in old])[:-1])
-    new = tuple(jnp.asarray(np.asarray(w, float) + d.reshape(w.shape), w.dtype) for w, d in zip(old, by, strict=True))
-    return eqx.tree_at(lambda u: u.potential, unknowns, unknowns.potential.with_linear_weights(new))
-
-
-def error_sizes(seen: StepSensitivity, recording: Recording) -> Float[np.ndarray, " R"]:
+def error_sizes(residual: Float[np.ndarray, "S 2 n d"], recording: Recording) -> Float[np.ndarray, " R"]:
     """Standard deviation of the error of each recorded number: one for the positions of a point, one for velocities.
 
-    Robust (median), from the steps without a closed contact: their residual has the errors of two states.
+    Robust (median), from residuals of single steps without a closed contact: they have the errors of two states.
     """
-    n, d = recording.x.shape[2:]
-    smooth = (seen.gap >= 0).all(axis=1) if seen.gap.shape[1] else np.ones(len(seen.gap), bool)
-    residual = seen.residual[smooth if smooth.sum() >= 10 else slice(None)].reshape(-1, 2, n, d)
     size = 1.4826 * np.median(np.abs(residual), axis=(0, 3)) / np.sqrt(2)
     speed = np.sqrt(np.mean(recording.v[:, 0] ** 2))
     floor = 1e-9 * max(speed, 1e-9) * np.array([recording.dt, 1.0])[:, None]
-    return np.repeat(np.maximum(size, floor).reshape(-1), d)
+    return np.repeat(np.maximum(size, floor).reshape(-1), residual.shape[3])
+
+
+def _errors(seen: StepSensitivity, recording: Recording) -> Float[np.ndarray, " R"]:
+    """`error_sizes` of the steps looked at."""
+    smooth = (seen.gap >= 0).all(axis=1) if seen.gap.shape[1] else np.ones(len(seen.gap), bool)
+    residual = seen.residual[smooth if smooth.sum() >= 10 else slice(None)]
+    return error_sizes(np.asarray(residual).reshape(-1, 2, *recording.x.shape[2:]), recording)
 
 
 def beyond_doubt(seen: StepSensitivity, errors: Float[np.ndarray, " R"], doubt: float) -> Bool[np.ndarray, " S"]:

@@ -61,7 +61,7 @@ def solve(
         weight = _redescending(distance) if redescend and k >= rounds // 3 else _huber(distance)
         weighted = weight / size
         H, g = _normal_equations(blocks, weighted, u)
-        target = _step(H, g, prior, pull + prior @ change, change, lower, upper)
+        target = newton_step(H, g, prior, pull + prior @ change, change, lower, upper)
         moved, change = np.abs(target - change).max(initial=0.0), target
         if moved < 1e-8 and k > rounds // 3:
             break
@@ -115,7 +115,7 @@ def _spectrum(H, prior):
     return directions, np.where(lost, np.maximum(alone, 1e-300), values), lost
 
 
-def _step(H, g, prior, pull, change, lower, upper):
+def newton_step(H, g, prior, pull, change, lower, upper):
     """Minimiser of the quadratic model, with those that would leave their bounds held there."""
     held: Bool[np.ndarray, " p"] = np.zeros(len(g), bool)
     target = change

@@ -17,15 +17,17 @@ from carom.contact.impulses import CMr, ContactModel
 from carom.errors import CaromError
 from carom.learning.baselines import BASELINES, new_baseline, physical_quantities, with_baseline
 from carom.learning.config import FORMULATIONS, LearnConfig
-from carom.learning.dataset import Chunks, Dataset, closed_contacts, contact_flags
+from carom.learning.data_checks import check_dataset
+from carom.learning.dataset import Chunks, Dataset, contact_flags
+from carom.learning.loss import gather_chunks, train_step, validate
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
-from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule, make_optimizer
+from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule
 from carom.learning.progress import LoopProgress, training_text
 from carom.learning.refine import Fit, can_be_refined, polish
 from carom.learning.run import RunFolder
+from carom.learning.shooting import Shot, estimate
 from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
-from carom.simulation.rollout import step
 from carom.system import StepModel, System
 
 
@@ -46,6 +48,8 @@ class LearnReport:
     overflowed_contacts: int
     refined: bool
     """Whether what was kept is what a refinement ended with (see `LearnConfig.refine`)."""
+    starts_estimated: bool = False
+    """Whether start states were estimated too, for data noisier than a step moves (see `carom.learning.shooting`)."""
     epsilon: float | None = None
     """Of the contact model CMr."""
 
@@ -119,85 +123,6 @@ LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
 
 
-def smooth_error(error: Float[Array, "*shape"], width: Float[Array, ""]) -> Float[Array, ""]:
-    """Mean of `sqrt(error^2 + width^2) - width`: the mean absolute error but for a quadratic part of `width`.
-
-    Masses and restitutions meet in valleys of the absolute error with sharp floors, along which no single quantity can
-    move: the smooth floor of a wide loss lets them travel together; narrowing it then gives the exact fit of the
-    absolute error (Charbonnier et al., 1994; graduated as in Blake and Zisserman, *Visual Reconstruction*, 1987).
-    """
-    return jnp.mean(jnp.sqrt(error**2 + width**2) - width)
-
-
-def chunk_errors(
-    unknowns: Unknowns, skeleton: System, stepper: Stepper, x: Float[Array, "B L n d"], v: Float[Array, "B L n d"]
-) -> tuple[Float[Array, "B M n d"], Float[Array, "B M n d"], Int[Array, ""]]:
-    """Errors of positions (m) and velocities (m/s) predicted from each chunk's first state, for the others.
-
-    Also how many closed contacts found no place in the solver.
-    """
-    system = unknowns.assemble(skeleton)
-
-    def predict(x0, v0):
-        def body(state, _):
-            out = step(system, state[0], state[1], stepper)
-            return (out.x, out.v), out
-
-        return jax.lax.scan(body, (x0, v0), length=x.shape[1] - 1)[1]
-
-    out = jax.vmap(predict)(x[:, 0], v[:, 0])
-    return out.x - x[:, 1:], out.v - v[:, 1:], jnp.sum(out.overflow)
-
-
-def chunk_loss(unknowns: Unknowns, skeleton: System, stepper: Stepper, x, v, width):
-    """What is minimised, with (mean absolute error of positions plus that of velocities, overflow) beside it.
-
-    `width` (m/s) is that of the quadratic part for velocities; for positions it is `width dt`.
-    """
-    error_x, error_v, overflow = chunk_errors(unknowns, skeleton, stepper, x, v)
-    loss = smooth_error(error_x, width * stepper.dt) + smooth_error(error_v, width)
-    return loss, (jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v)), overflow)
-
-
-def gather_chunks(x, v, trajectory, start, length: int):
-    """Chunks `(B, length, n, d)` of the recorded states."""
-    times = start[:, None] + np.arange(length, dtype=np.int32)
-    return x[trajectory[:, None], times], v[trajectory[:, None], times]
-
-
-@eqx.filter_jit
-def train_step(data, unknowns, opt_state, rates: Rates, stepper, length, width):
-    """One step of the optimiser. A step whose gradient is not finite is left out and counted."""
-    skeleton, x, v, trajectory, start = data
-    chunk = gather_chunks(x, v, trajectory, start, length)
-    gradient = eqx.filter_value_and_grad(chunk_loss, has_aux=True)
-    (loss, (error, overflow)), grads = gradient(unknowns, skeleton, stepper, *chunk, width)
-    with jax.numpy_dtype_promotion("standard"):  # optax mixes its counters with floats
-        updates, new_state = make_optimizer(rates).update(grads, opt_state, eqx.filter(unknowns, eqx.is_inexact_array))
-    new = eqx.apply_updates(unknowns, updates).project()
-    finite = jnp.isfinite(loss)
-    for leaf in jax.tree.leaves(grads):
-        finite = finite & jnp.isfinite(leaf).all()
-
-    def choose(a, b):
-        return jnp.where(finite, a, b) if eqx.is_array(a) else a
-
-    unknowns = jax.tree.map(choose, new, unknowns)
-    opt_state = jax.tree.map(choose, new_state, opt_state)
-    return unknowns, opt_state, error, overflow, ~finite
-
-
-@eqx.filter_jit
-def validate(unknowns, skeleton, x, v, stepper):
-    """Mean absolute error of positions plus that of velocities, for chunks that are not trained on.
-
-    And the same for the better nine tenths of the chunks.
-    """
-    error_x, error_v, _ = chunk_errors(unknowns, skeleton, stepper, x, v)
-    chunk = jnp.mean(jnp.abs(error_x) + jnp.abs(error_v), axis=(1, 2, 3))
-    return jnp.mean(chunk), jnp.mean(jnp.sort(chunk)[: max(1, chunk.size * 9 // 10)])
-
-
 def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> TrainState:
     """The state before the first epoch; a network is scaled to `recording`."""
     unknowns = initial_unknowns(skeleton, config, recording)
@@ -205,54 +130,6 @@ def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | No
     infinity = jnp.asarray(jnp.inf)
     optimizer = fresh_optimizer(unknowns, config)
     return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False))
-
-
-def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
-    """Raise `CaromError` where data and skeleton do not fit; return the largest number of contacts closed at once."""
-    shape = (skeleton.n_points, skeleton.dim)
-    require(
-        dataset.train.x.shape[2:] == shape,
-        f"the data have {dataset.train.x.shape[2]} points in {dataset.train.x.shape[3]}D, the system has {shape[0]} in "
-        f"{shape[1]}D. Is this a file of another task?",
-    )
-    require(
-        int(dataset.train.length.max()) >= config.states,
-        f"chunk_length is {config.states} states, but the longest training trajectory has "
-        f"{int(dataset.train.length.max())}. Use longer trajectories or a shorter chunk.",
-    )
-    most = 0
-    for name, part in (("train", dataset.train), ("val", dataset.val)):
-        valid = part.valid
-        drift = np.abs(np.asarray(skeleton.constraints(jnp.asarray(part.x[valid]))))
-        limit = 5e-2
-        require(
-            drift.size == 0 or drift.max() <= limit,
-            f"the {name} data do not fit the system's rods and joints: a constraint is off by "
-            f"{drift.max() if drift.size else 0:.2g} m^2. Check units, order of the points and lengths.",
-        )
-        most = max(most, int(np.where(valid, closed_contacts(part.x, skeleton), 0).max()))
-        check_not_inside(name, part, skeleton, valid)
-    return most
-
-
-def check_not_inside(name: str, part: Recording, skeleton: System, valid: np.ndarray) -> None:
-    """Raise `CaromError` for recorded states with a body in a wall, or bodies through each other."""
-    if not skeleton.contacts:
-        return
-    gaps = np.asarray(skeleton.gaps(jnp.asarray(part.x[valid])))
-    through = gaps < -np.asarray(skeleton.reach()) - 1e-9
-    if through.any():
-        row, candidate = np.argwhere(through)[0]
-        trajectory, sample = np.argwhere(valid)[row]
-        bodies = [b for contact in skeleton.contacts for b in contact.bodies_of()][candidate]
-        what = (
-            f"body {bodies[0]} in a wall" if len(bodies) == 1 else f"bodies {bodies[0]} and {bodies[1]} in each other"
-        )
-        require(
-            False,
-            f"the {name} data have {what} (trajectory {trajectory}, sample {sample}, {-gaps[row, candidate]:.3g} m "
-            f"deep, {int(through.any(axis=1).sum())} samples in all). Check units, radii and walls.",
-        )
 
 
 def learn(
@@ -289,72 +166,181 @@ def learn(
             'jax.config.update("jax_enable_x64", True) before it is made; refine=False silences this.',
             stacklevel=2,
         )
-    most = check_dataset(skeleton, dataset, config)
-    # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
-    trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
-    train, val = dataset.train, dataset.val
-    chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.states)
-    smooth, impact = chunks.count()
-    require(smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from.")
-    steps = config.steps_per_epoch
-    state = fresh_state(skeleton, config, train)
-    restored = run.restore_checkpoint(state) if run is not None else None
-    if run is not None and restored is not None:
-        state = restored
-        run.rewind_metrics(int(state.epoch))
-    elif run is not None and run.metrics():  # killed before its first checkpoint
-        run.rewind_metrics(-1)
-    stepper = Stepper(
-        dt=jnp.asarray(train.dt),
-        formulation=FORMULATIONS[config.model],
-        project=config.project,
-        compensation_steps=config.compensation_steps,
-        consistent=True,
-    )
-    x, v = jnp.asarray(train.x), jnp.asarray(train.v)
-    speed = float(np.sqrt(np.mean(train.v[train.valid] ** 2)))
+    return _Training(skeleton, dataset, config, run).go(progress)
 
-    def width(epoch: int) -> Float[Array, ""]:
-        done = (epoch - 1) / config.epochs
-        return jnp.asarray(config.loss_width * speed * LOSS_WIDTH_DECAY**done, train.x.dtype)
 
-    rate = learning_rate_schedule(config, config.epochs * steps)
-    held_out = _validation_chunks(val, skeleton, config)
-    last = run.metrics()[-1] if run is not None and restored is not None else {"seconds": 0.0}
-    started = time.monotonic() - last["seconds"]
-    loss = jnp.asarray(last.get("loss", np.nan))
-    stopped = False
-    refines = config.refine and can_be_refined(state.unknowns, trained)
-    refine_at = round(REFINE_AFTER * config.epochs)
-    enough = config.enough * speed
+class _Training:
+    """One training: what is held while it goes on, and its state."""
 
-    def judge(unknowns: Unknowns) -> Fit:
-        return Fit(*map(float, validate(unknowns, trained, *held_out, stepper)))
+    def __init__(self, skeleton: System, dataset: Dataset, config: LearnConfig, run: RunFolder | None):
+        self.skeleton, self.dataset, self.config, self.run = skeleton, dataset, config, run
+        most = check_dataset(skeleton, dataset, config)
+        # Room for as many contacts as the data ever close at once, and two more for predictions that stray.
+        self.trained = skeleton.with_max_active(most + 2) if skeleton.contacts else skeleton
+        train = dataset.train
+        self.chunks = Chunks.of(contact_flags(train, skeleton), train.length, config.states)
+        smooth, impact = self.chunks.count()
+        require(
+            smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from."
+        )
+        self.state = fresh_state(skeleton, config, train)
+        restored = run.restore_checkpoint(self.state) if run is not None else None
+        if run is not None and restored is not None:
+            self.state = restored
+            run.rewind_metrics(int(restored.epoch))
+        elif run is not None and run.metrics():  # killed before its first checkpoint
+            run.rewind_metrics(-1)
+        self.resumed = restored is not None
+        self.stepper = Stepper(
+            dt=jnp.asarray(train.dt),
+            formulation=FORMULATIONS[config.model],
+            project=config.project,
+            compensation_steps=config.compensation_steps,
+            consistent=True,
+        )
+        self.speed = float(np.sqrt(np.mean(train.v[train.valid] ** 2)))
+        self.enough = config.enough * self.speed
+        self.held_out = _validation_chunks(dataset.val, skeleton, config)
+        last = run.metrics()[-1] if run is not None and self.resumed else {"seconds": 0.0}
+        self.started = time.monotonic() - last["seconds"]
+        self.loss = float(last.get("loss", np.nan))
+        self.refines = config.refine and can_be_refined(self.state.unknowns, self.trained)
+        self.refine_at = round(REFINE_AFTER * config.epochs)
+        self.refinements = itertools.count(1)  # before the first epoch, for the log
 
-    def log(epoch: int, unknowns: Unknowns, **numbers: Any) -> dict[str, Any]:
+    def go(self, progress: bool) -> tuple[System, LearnReport]:
+        """Refine, learn for as many epochs as it takes, refine again: the learned system."""
+        config, stopped, refined, shot = self.config, False, False, None
+        with LoopProgress("epoch", config.epochs, int(self.state.epoch), shown=progress) as self.shown:
+            if self.refines and not self.resumed:
+                shot = self.begin()
+            fit = self.judge(self.state.best)
+            done = shot is not None and shot.fits
+            while not done and int(self.state.epoch) < config.epochs:
+                if (self.just_refined and fit.typical <= self.enough) or self.waited >= config.patience:
+                    stopped = True
+                    break
+                fit = self.epoch(int(self.state.epoch) + 1, fit)
+            best = self.state.best
+            again = not (self.just_refined and int(self.state.epoch) == int(self.state.best_epoch))
+            if self.refines and again and not done:
+                better = self.refined(best, fit, whole=True)
+                refined = better is not None
+                best, fit = (best, fit) if better is None else better
+            if self.refines and not done and (shot is not None or self.resumed):
+                shots = (shot, self.estimated(best))
+                shot = min((one for one in shots if one is not None), key=lambda one: one.cost, default=None)
+            if shot is not None:
+                best, fit, refined = shot.unknowns, self.judge(shot.unknowns), True
+        if best.potential is not None:
+            best = dataclasses.replace(best, potential=best.potential.pruned())
+        system = best.assemble(self.skeleton)
+        report = LearnReport(
+            **quantities(system),
+            train_loss=self.loss if int(self.state.epoch) else None,
+            val_loss=fit.mean,
+            epochs=int(self.state.epoch),
+            seconds=time.monotonic() - self.started,
+            stopped_early=stopped or done,
+            skipped_steps=int(self.state.skipped),
+            overflowed_contacts=int(self.state.overflow),
+            refined=self.just_refined or refined,
+            starts_estimated=shot is not None,
+        )
+        return system, report
+
+    def begin(self) -> Shot | None:
+        """Refine the starting values; with noisy data, estimate start states too, and return what came of it.
+
+        If that fits, it is the end; else training goes on from what was refined, and is resumed there.
+        """
+        fit = self.judge(self.state.unknowns)
+        self.log(0, self.state.unknowns, refinement=0, val_loss=fit.mean)
+        better = self.refined(self.state.unknowns, fit, whole=False)
+        shot = self.estimated(self.state.unknowns if better is None else better[0])
+        if shot is not None:
+            number = next(self.refinements)
+            self.log(0, shot.unknowns, refinement=number, val_loss=self.judge(shot.unknowns).mean)
+        if better is not None and not (shot is not None and shot.fits):
+            self.settle(better)
+            self.state = _keep_best(self.state, better[1].mean, 0)
+            if self.run is not None:
+                self.run.save_checkpoint(0, self.state)
+        return shot
+
+    @property
+    def just_refined(self) -> bool:
+        """Whether the best unknowns are what a refinement ended with."""
+        return bool(self.state.settled) and int(self.state.best_epoch) in (0, self.refine_at)
+
+    @property
+    def waited(self) -> int:
+        """Epochs without a better validation loss."""
+        return int(self.state.epoch) - int(self.state.best_epoch)
+
+    def judge(self, unknowns: Unknowns) -> Fit:
+        """How well unknowns predict the chunks that are held out."""
+        return Fit(*map(float, validate(unknowns, self.trained, *self.held_out, self.stepper)))
+
+    def log(self, epoch: int, unknowns: Unknowns, **numbers: Any) -> dict[str, Any]:
+        """An entry of the run's metrics."""
         metrics = {
             "epoch": epoch,
-            "step": epoch * steps,
-            "seconds": round(time.monotonic() - started, 3),
+            "step": epoch * self.config.steps_per_epoch,
+            "seconds": round(time.monotonic() - self.started, 3),
             **numbers,
-            **quantities(unknowns.assemble(skeleton)),
-            "skipped_steps": int(state.skipped),
-            "overflowed_contacts": int(state.overflow),
+            **quantities(unknowns.assemble(self.skeleton)),
+            "skipped_steps": int(self.state.skipped),
+            "overflowed_contacts": int(self.state.overflow),
         }
-        if run is not None:
-            run.log(metrics)
+        if self.run is not None:
+            self.run.log(metrics)
         return metrics
 
-    def just_refined(state: TrainState) -> bool:
-        return bool(state.settled) and int(state.best_epoch) in (0, refine_at)
+    def epoch(self, epoch: int, fit: Fit) -> Fit:
+        """Learn from `chunks_per_epoch` chunks; returns how well the best unknowns fit, `fit` before."""
+        config = self.config
+        done = (epoch - 1) / config.epochs
+        width = jnp.asarray(config.loss_width * self.speed * LOSS_WIDTH_DECAY**done, self.dataset.train.x.dtype)
+        rate = learning_rate_schedule(config, config.epochs * config.steps_per_epoch)
+        self.state, loss = _epoch(
+            self.state, epoch, self.trained, self.dataset.train, self.chunks, rate, self.stepper, width, config
+        )
+        self.loss = float(loss)
+        now = self.judge(self.state.unknowns)
+        if self.refines and epoch == self.refine_at:
+            better = self.refined(self.state.unknowns, now, whole=True)
+            if better is not None:
+                now = better[1]
+                self.settle(better)
+        if now.mean < float(self.state.best_loss):
+            fit = now
+        self.state = _keep_best(self.state, now.mean, epoch)
+        learning_rate = float(np.asarray(rate(epoch * config.steps_per_epoch)))
+        metrics = self.log(epoch, self.state.unknowns, loss=self.loss, val_loss=now.mean, learning_rate=learning_rate)
+        due = epoch % config.checkpoint_every == 0 or epoch in (self.refine_at, config.epochs)
+        if self.run is not None and due:
+            self.run.save_checkpoint(epoch, self.state)
+        self.shown.update(epoch, training_text(metrics))
+        require(
+            np.isfinite(self.loss) or epoch < 3 or not np.isinf(float(self.state.best_loss)),
+            f"the training loss is not finite ({int(self.state.skipped)} steps left out). Check the data, or lower "
+            "learning_rate.",
+        )
+        return fit
 
-    def refined(unknowns: Unknowns, fit: Fit, *, whole: bool) -> tuple[Unknowns, Fit] | None:
+    def settle(self, better: tuple[Unknowns, Fit]) -> None:
+        """Go on from what was refined."""
+        optimizer = fresh_optimizer(better[0], self.config)
+        self.state = dataclasses.replace(self.state, unknowns=better[0], optimizer=optimizer, settled=jnp.asarray(True))
+
+    def refined(self, unknowns: Unknowns, fit: Fit, *, whole: bool) -> tuple[Unknowns, Fit] | None:
         """Unknowns that validate better than these, and how well: of the simplest potential that is enough.
 
         `whole`: try the whole potential too. If not, this is the first time: each step is logged.
         """
-        shown.say("refining ...")
-        best, full, count = None, unknowns.potential, itertools.count(1)
+        self.shown.say("refining ...")
+        best, full = None, unknowns.potential
 
         def extended(new: Unknowns) -> Unknowns:
             if full is None or new.potential is None:
@@ -362,80 +348,31 @@ def learn(
             return dataclasses.replace(new, potential=new.potential.extended(full))
 
         def judge_step(new: Unknowns) -> Fit:
-            found = judge(extended(new))
+            found = self.judge(extended(new))
             if not whole:
-                log(0, new, refinement=next(count), val_loss=found.mean)
+                self.log(0, new, refinement=next(self.refinements), val_loss=found.mean)
             return found
 
         for potential in ([] if full is None else full.simpler()) + ([full] if whole or full is None else []):
             start = dataclasses.replace(unknowns, potential=potential)
-            new, found = polish(start, trained, stepper, train, judge_step, EXACT * enough)
+            new, found = polish(start, self.trained, self.stepper, self.dataset.train, judge_step, EXACT * self.enough)
             if found.mean < fit.mean:
                 best, fit = (extended(new), found), found
-            if found.typical <= enough:
+            if found.typical <= self.enough:
                 break
         return best
 
-    def settle(state: TrainState, better: tuple[Unknowns, Fit]) -> TrainState:
-        """Go on from what was refined."""
-        optimizer = fresh_optimizer(better[0], config)
-        return dataclasses.replace(state, unknowns=better[0], optimizer=optimizer, settled=jnp.asarray(True))
+    def estimated(self, unknowns: Unknowns) -> Shot | None:
+        """Unknowns estimated together with start states, if the data are so noisy that this is called for."""
+        if unknowns.potential is not None:
+            unknowns = dataclasses.replace(unknowns, potential=unknowns.potential.pruned())
 
-    with LoopProgress("epoch", config.epochs, int(state.epoch), shown=progress) as shown:
-        if refines and restored is None:
-            fit = judge(state.unknowns)
-            log(0, state.unknowns, refinement=0, val_loss=fit.mean)
-            better = refined(state.unknowns, fit, whole=False)
-            if better is not None:
-                state = _keep_best(settle(state, better), better[1].mean, 0)
-                if run is not None:
-                    run.save_checkpoint(0, state)
-        fit = judge(state.best)
-        for epoch in range(int(state.epoch) + 1, config.epochs + 1):
-            if just_refined(state) and fit.typical <= enough:
-                stopped = True
-                break
-            state, loss = _epoch(state, epoch, trained, x, v, chunks, rate, stepper, width(epoch), config)
-            now = judge(state.unknowns)
-            if refines and epoch == refine_at:
-                better = refined(state.unknowns, now, whole=True)
-                if better is not None:
-                    now, state = better[1], settle(state, better)
-            if now.mean < float(state.best_loss):
-                fit = now
-            state = _keep_best(state, now.mean, epoch)
-            learning_rate = float(np.asarray(rate(epoch * steps)))
-            metrics = log(epoch, state.unknowns, loss=float(loss), val_loss=now.mean, learning_rate=learning_rate)
-            if run is not None and (epoch % config.checkpoint_every == 0 or epoch in (refine_at, config.epochs)):
-                run.save_checkpoint(epoch, state)
-            shown.update(epoch, training_text(metrics))
-            require(
-                bool(jnp.isfinite(loss)) or epoch < 3 or not np.isinf(float(state.best_loss)),
-                f"the training loss is not finite ({int(state.skipped)} steps left out). Check the data, or lower "
-                "learning_rate.",
-            )
-            if epoch - int(state.best_epoch) >= config.patience:
-                stopped = True
-                break
-        best = state.best
-        again = not (just_refined(state) and int(state.epoch) == int(state.best_epoch))
-        better = refined(best, fit, whole=True) if refines and again else None
-        best, fit = (best, fit) if better is None else better
-    if best.potential is not None:
-        best = dataclasses.replace(best, potential=best.potential.pruned())
-    system = best.assemble(skeleton)
-    report = LearnReport(
-        **quantities(system),
-        train_loss=float(loss) if int(state.epoch) else None,
-        val_loss=fit.mean,
-        epochs=int(state.epoch),
-        seconds=time.monotonic() - started,
-        stopped_early=stopped,
-        skipped_steps=int(state.skipped),
-        overflowed_contacts=int(state.overflow),
-        refined=just_refined(state) or better is not None,
-    )
-    return system, report
+        number = itertools.count(1)
+
+        def each() -> None:
+            self.shown.say(f"noisy data: estimating start states too, step {next(number)} ...")
+
+        return estimate(unknowns, self.trained, self.stepper, self.dataset, seed=self.config.seed, each=each)
 
 
 def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
@@ -447,9 +384,10 @@ def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
     return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.states)
 
 
-def _epoch(state: TrainState, epoch: int, skeleton, x, v, chunks, rate, stepper, width, config):
+def _epoch(state: TrainState, epoch: int, skeleton, train: Recording, chunks, rate, stepper, width, config):
     """Learn from `chunks_per_epoch` new chunks. Their choice depends on seed and epoch alone, so that it can resume."""
     rng = np.random.default_rng((config.seed, 0, epoch))
+    x, v = jnp.asarray(train.x), jnp.asarray(train.v)
     unknowns, opt_state = state.unknowns, state.optimizer
     losses, overflow, skipped = [], state.overflow, state.skipped
     drawn = chunks.draw(rng, config.chunks_per_epoch, config.contact_share)

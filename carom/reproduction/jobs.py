@@ -15,11 +15,14 @@ import carom
 from carom.checks import require
 from carom.learning.config import BASELINES, FORMULATIONS, LearnConfig, Model
 from carom.learning.dataset import Dataset
-from carom.learning.evaluate import evaluate
+from carom.learning.evaluate import energy_errors, evaluate, mean_and_interval, state_errors
+from carom.learning.identify import identify
 from carom.learning.model_file import save_model
+from carom.learning.refine import MOST_POINTS
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
 from carom.learning.train import learn
 from carom.simulation.files import Recording
+from carom.system import System
 from carom.tasks import make_data_sets, noisy, task
 
 TEST_SEED = 1_000_000
@@ -29,7 +32,11 @@ TEST_TRAJECTORIES = 100
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """What is learned from what. Jobs that are equal are one training, however many tables ask for it."""
+    """What is learned from what. Jobs that are equal are one training, however many tables ask for it.
+
+    What is learned from data of LCP with another contact model is tested on data of CM with CM itself: whether the
+    properties are right is then the question, not how the contact models differ.
+    """
 
     task: str
     model: Model = "clnn"
@@ -100,13 +107,14 @@ class Job:
                 say(f"{self.name}: learning from {dataset.train.n_trajectories} trajectories")
             system, report = learn(truth, dataset, self._quickened() if quick else self.config(), run=run)
             save_model(path / MODEL, system, formulation=FORMULATIONS[self.model])
-            measures = {
-                name: evaluate(system, test, truth=truth, formulation=FORMULATIONS[self.model])[0]
-                for name, test in tests.items()
-            }
+            measures, curves = {}, {}
+            for name, test in tests.items():
+                measures[name], curves[name] = self._measured(system, test, truth, name)
             content = {
                 "learned": dataclasses.asdict(report),
                 "evaluation": measures,
+                "over_time": curves,
+                "identification": self._identified(system, dataset),
                 "provenance": {
                     "digest": self.digest(quick),
                     "seconds": round(time.monotonic() - started, 1),
@@ -118,6 +126,21 @@ class Job:
             return run.read_json(REPORT)
         finally:
             run.close()
+
+    def _measured(self, system: System, test: Recording, truth: System, data: str):
+        """Measures, and errors over time, of predictions; see `Job` for the contact model that they are made with."""
+        if self.contact_model != self.data == "lcp" != data:
+            system = system.with_contact_model(data)
+        measures, predicted = evaluate(system, test, truth=truth, formulation=FORMULATIONS[self.model])
+        errors = {"state": state_errors(test, predicted)[0], "energy": energy_errors(test, predicted, truth)}
+        return measures, {name: mean_and_interval(error) for name, error in errors.items()}
+
+    def _identified(self, system: System, dataset: Dataset) -> dict[str, Any] | None:
+        """What exact data of CM tell, with standard errors; None for other jobs, and for systems too large."""
+        wanted = self.model not in BASELINES and self.data == "cm" and not self.noise and self.epsilon is None
+        if not wanted or system.n_points > MOST_POINTS:
+            return None
+        return dataclasses.asdict(identify(system, dataset.train, formulation=FORMULATIONS[self.model]))
 
     def _data(self, quick: bool) -> tuple[Dataset, dict[str, Recording]]:
         """To learn from, and to test with: by the contact model of the data, and by CM where that is another."""

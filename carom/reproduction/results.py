@@ -12,10 +12,13 @@ import numpy as np
 from carom.atomic import write_whole
 from carom.reproduction.jobs import Job
 from carom.reproduction.tables import BUILDERS, Cell, Table
+from carom.tasks import find_task
 
 ZERO = 1e-4
 """A printed error of zero is met, and beaten, by one of at most this."""
 TIMES_BETTER = 3.0
+PICTURES = {"state": "errors_over_time.png", "energy": "energy_over_time.png"}
+"""Files of the pictures of errors over time."""
 
 
 def deviation(cell: Cell, value: float) -> float:
@@ -25,10 +28,11 @@ def deviation(cell: Cell, value: float) -> float:
     return abs(value - cell.true) / max(abs(cell.true), 1.0)
 
 
-def measured(cell: Cell, values: list[float | None]) -> dict[str, Any]:
+def measured(cell: Cell, values: list[float | None], errors: list[float | None] | None = None) -> dict[str, Any]:
     """A cell's entry: mean over seeds with its 95 % interval, error, the paper's, and their ratio.
 
-    `verdict`: "better" (by `TIMES_BETTER`), "met", "worse", or "" where there is nothing to compare with.
+    `verdict`: "better" (by `TIMES_BETTER`), "met", "worse", or "" where there is nothing to compare with; `counted`,
+    whether it counts. `errors`: standard errors, by seed, where there are any.
     """
     found = [float(v) for v in values if v is not None]
     finite = bool(found) and len(found) == len(values) and bool(np.all(np.isfinite(found)))
@@ -51,7 +55,11 @@ def measured(cell: Cell, values: list[float | None]) -> dict[str, Any]:
         "ratio": None,
         "verdict": "",
         "note": cell.note,
+        "counted": cell.counted,
     }
+    known = [e for e in errors or [] if e is not None]
+    if known:
+        out["standard_error"] = float(np.mean(known))
     if cell.job is None or paper_error is None:
         return out
     if error is None:
@@ -76,10 +84,16 @@ def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, qui
         jobs = [dataclasses.replace(cell.job, seed=seed) for seed in range(seeds)]
         done = [reports[job] for job in jobs if job in reports]
         if done:
-            cells.append(measured(cell, [cell.read(report) for report in done]))
+            errors = None if cell.read_error is None else [cell.read_error(report) for report in done]
+            cells.append(measured(cell, [cell.read(report) for report in done], errors))
         else:
             cells.append({**measured(dataclasses.replace(cell, job=None), []), "note": "not run yet"})
     runs = {job.name: report["provenance"] for job, report in reports.items()}
+    curves = [
+        {"row": cell.row, "column": cell.column, **_mean_over_seeds(cell.job, reports)}
+        for cell in table.cells
+        if table.over_time and cell.job is not None and any(_of(cell.job, job) for job in reports)
+    ]
     return {
         "table": table.name,
         "title": table.title,
@@ -90,12 +104,33 @@ def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, qui
         "runs": runs,
         "commit": commit(),
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        **({"over_time": curves} if curves else {}),
     }
+
+
+def _of(job: Job, other: Job) -> bool:
+    """Whether they differ in their seeds alone."""
+    return dataclasses.replace(job, seed=other.seed) == other
+
+
+def _mean_over_seeds(job: Job, reports: dict[Job, dict[str, Any]]) -> dict[str, Any]:
+    """Errors over time of all seeds of a job together: of the same number of trajectories each."""
+    seeds = [report["over_time"][job.data] for other, report in reports.items() if _of(job, other)]
+    out: dict[str, Any] = {"dt": find_task(job.task).dt}
+    for quantity in ("state", "energy"):
+        mean, half, median = (
+            np.array([seed[quantity][k] for seed in seeds], float) for k in ("mean", "ci95", "median")
+        )
+        # Independent test sets: the variance of their mean.
+        spread = np.sqrt(np.sum(half**2, axis=0)) / len(seeds)
+        named = {"mean": mean.mean(axis=0), "ci95": spread, "median": median.mean(axis=0)}
+        out[quantity] = {name: [float(f"{v:.4g}") for v in values] for name, values in named.items()}
+    return out
 
 
 def summary(cells: list[dict[str, Any]]) -> dict[str, int]:
     """How many cells can be compared, are at least as good as the paper's, and are three times better."""
-    verdicts = [cell["verdict"] for cell in cells if cell["verdict"]]
+    verdicts = [cell["verdict"] for cell in cells if cell["verdict"] and cell["counted"]]
     return {
         "compared": len(verdicts),
         "met": sum(verdict in ("met", "better") for verdict in verdicts),
@@ -138,10 +173,11 @@ def markdown(content: dict[str, Any]) -> str:
     lines = [f"## {content['title']}", ""]
     if content["quick"]:
         lines += ["A smoke run (`--quick`): the numbers mean nothing.", ""]
-    lines += [
-        "| row | column | true | paper | carom | error of the paper | error of carom | ratio | |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["row", "column", "true", "paper", "carom", "error of the paper", "error of carom", "ratio", ""]
+    told = any("standard_error" in cell for cell in content["cells"])
+    if told:
+        head.insert(5, "standard error")
+    lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for cell in content["cells"]:
         carom = _number(cell["carom"])
         if cell["ci95"] is not None:
@@ -155,8 +191,10 @@ def markdown(content: dict[str, Any]) -> str:
             _number(cell["paper_error"]),
             _number(cell["error"]),
             _number(cell["ratio"]),
-            cell["verdict"],
+            cell["verdict"] if cell["counted"] or not cell["verdict"] else f"({cell['verdict']})",
         ]
+        if told:
+            row.insert(5, _number(cell.get("standard_error")))
         lines.append("| " + " | ".join(row) + " |")
     counts = content["summary"]
     if counts["compared"]:
@@ -167,6 +205,8 @@ def markdown(content: dict[str, Any]) -> str:
         ]
     if content["note"]:
         lines += ["", content["note"]]
+    if "over_time" in content:
+        lines += [""] + [f"![{name.removesuffix('.png')}](images/{name})" for name in PICTURES.values()]
     if content["runs"]:
         seconds = sum(run["seconds"] for run in content["runs"].values())
         lines += [
@@ -204,3 +244,15 @@ def page(folder: Path) -> str:
         "",
     ]
     return "\n".join([*lines, "\n".join(parts)])
+
+
+def pictures(folder: Path, images: Path) -> list[Path]:
+    """Draw errors over time, if the folder has `figure3`; returns the PNGs' paths."""
+    path = folder / "figure3.json"
+    content = json.loads(path.read_text()) if path.exists() else {}
+    if "over_time" not in content:
+        return []
+    from carom.reproduction.figure import draw  # matplotlib is slow to import
+
+    images.mkdir(parents=True, exist_ok=True)
+    return [draw(content, quantity, images / name) for quantity, name in PICTURES.items()]

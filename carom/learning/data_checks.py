@@ -1,0 +1,58 @@
+"""Whether data and skeleton fit, before a training begins."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from carom.checks import require
+from carom.learning.config import LearnConfig
+from carom.learning.dataset import Dataset, closed_contacts
+from carom.simulation.files import Recording
+from carom.system import System
+
+
+def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
+    """Raise `CaromError` where data and skeleton do not fit; return the largest number of contacts closed at once."""
+    shape = (skeleton.n_points, skeleton.dim)
+    require(
+        dataset.train.x.shape[2:] == shape,
+        f"the data have {dataset.train.x.shape[2]} points in {dataset.train.x.shape[3]}D, the system has {shape[0]} in "
+        f"{shape[1]}D. Is this a file of another task?",
+    )
+    require(
+        int(dataset.train.length.max()) >= config.states,
+        f"chunk_length is {config.states} states, but the longest training trajectory has "
+        f"{int(dataset.train.length.max())}. Use longer trajectories or a shorter chunk.",
+    )
+    most = 0
+    for name, part in (("train", dataset.train), ("val", dataset.val)):
+        valid = part.valid
+        drift = np.abs(np.asarray(skeleton.constraints(jnp.asarray(part.x[valid]))))
+        limit = 5e-2
+        require(
+            drift.size == 0 or drift.max() <= limit,
+            f"the {name} data do not fit the system's rods and joints: a constraint is off by "
+            f"{drift.max() if drift.size else 0:.2g} m^2. Check units, order of the points and lengths.",
+        )
+        most = max(most, int(np.where(valid, closed_contacts(part.x, skeleton), 0).max()))
+        check_not_inside(name, part, skeleton, valid)
+    return most
+
+
+def check_not_inside(name: str, part: Recording, skeleton: System, valid: np.ndarray) -> None:
+    """Raise `CaromError` for recorded states with a body in a wall, or bodies through each other."""
+    if not skeleton.contacts:
+        return
+    gaps = np.asarray(skeleton.gaps(jnp.asarray(part.x[valid])))
+    through = gaps < -np.asarray(skeleton.reach()) - 1e-9
+    if through.any():
+        row, candidate = np.argwhere(through)[0]
+        trajectory, sample = np.argwhere(valid)[row]
+        bodies = [b for contact in skeleton.contacts for b in contact.bodies_of()][candidate]
+        what = (
+            f"body {bodies[0]} in a wall" if len(bodies) == 1 else f"bodies {bodies[0]} and {bodies[1]} in each other"
+        )
+        require(
+            False,
+            f"the {name} data have {what} (trajectory {trajectory}, sample {sample}, {-gaps[row, candidate]:.3g} m "
+            f"deep, {int(through.any(axis=1).sum())} samples in all). Check units, radii and walls.",
+        )
