@@ -57,7 +57,7 @@ class Learn:
     data_contact_model: ContactModelName = "cm"
     """Contact model of the simulated data; `--contact-model` is the one to learn with."""
     data_noise: float = 0.0
-    """Standard deviation of errors put on simulated data to learn from (rad and rad/s for pendulums, else m and m/s)."""
+    """Standard deviation of errors on simulated data to learn from (rad and rad/s for pendulums, else m and m/s)."""
     quick: bool = False
     """A small training of one minute or so after compilation, to try things out: few trajectories and epochs."""
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
