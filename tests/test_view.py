@@ -30,7 +30,7 @@ from carom.view.figures import (
     trajectory_error,
 )
 from carom.view.scene import lines_of, touching
-from carom.view.style import DPI, ORANGE, TINT
+from carom.view.style import DPI, ORANGE, TINT, theme
 
 NAN, INF = math.nan, math.inf
 HEADER = 58  # pixels above the scene, with legend and time
@@ -520,3 +520,19 @@ def test_mp4(tmp_path):
             assert reader.get_meta_data()["size"][0] == 400
             assert reader.count_frames() == 120  # 100 and the last one for another 0.8 s
     assert os.listdir(tmp_path) == ["a.mp4"]
+
+
+def test_figures_for_a_dark_background(tmp_path):
+    time, errors = np.arange(1, 11) * 0.1, {"learned": np.geomspace(1e-4, 1e-2, 30).reshape(3, 10)}
+    light = trajectory_error(time, errors, tmp_path / "light.png")
+    with theme("dark"):
+        dark = trajectory_error(time, errors, tmp_path / "dark.png")
+    again = trajectory_error(time, errors, tmp_path / "again.png")
+    assert light.read_bytes() == again.read_bytes()
+    brightness = [np.asarray(Image.open(path).convert("L"), float) for path in (light, dark)]
+    assert brightness[0].shape == brightness[1].shape
+    assert np.median(brightness[0]) > 250
+    assert np.median(brightness[1]) < 40
+    assert brightness[1].max() > 200  # text
+    with pytest.raises(CaromError, match="theme must be 'light' or 'dark'; it was 'grey'"), theme("grey"):
+        pass

@@ -4,8 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from carom.learning.devices import AXIS
 from carom.learning.models import Unknowns
 from carom.learning.optimizer import Rates, make_optimizer
 from carom.simulation.impact import Stepper
@@ -13,14 +15,14 @@ from carom.simulation.rollout import step
 from carom.system import System
 
 
-def smooth_error(error: Float[Array, "*shape"], width: Float[Array, ""]) -> Float[Array, ""]:
-    """Mean of `sqrt(error^2 + width^2) - width`: the mean absolute error but for a quadratic part of `width`.
+def smooth_error(error: Float[Array, "*shape"], width: Float[Array, ""]) -> Float[Array, "*shape"]:
+    """`sqrt(error^2 + width^2) - width`: the absolute error but for a quadratic part of `width`.
 
     Masses and restitutions meet in valleys of the absolute error with sharp floors, along which no single quantity can
     move: the smooth floor of a wide loss lets them travel together; narrowing it then gives the exact fit of the
     absolute error (Charbonnier et al., 1994; graduated as in Blake and Zisserman, *Visual Reconstruction*, 1987).
     """
-    return jnp.mean(jnp.sqrt(error**2 + width**2) - width)
+    return jnp.sqrt(error**2 + width**2) - width
 
 
 def chunk_errors(
@@ -43,14 +45,19 @@ def chunk_errors(
     return out.x - x[:, 1:], out.v - v[:, 1:], jnp.sum(out.overflow)
 
 
-def chunk_loss(unknowns: Unknowns, skeleton: System, stepper: Stepper, x, v, width):
+def chunk_loss(unknowns: Unknowns, skeleton: System, stepper: Stepper, x, v, share, width):
     """What is minimised, with (mean absolute error of positions plus that of velocities, overflow) beside it.
 
-    `width` (m/s) is that of the quadratic part for velocities; for positions it is `width dt`.
+    `share` (B,): of each chunk in the means, which is that of a batch if they add up to 1. `width` (m/s) is that of the
+    quadratic part for velocities; for positions it is `width dt`.
     """
     error_x, error_v, overflow = chunk_errors(unknowns, skeleton, stepper, x, v)
-    loss = smooth_error(error_x, width * stepper.dt) + smooth_error(error_v, width)
-    return loss, (jnp.mean(jnp.abs(error_x)) + jnp.mean(jnp.abs(error_v)), overflow)
+
+    def mean(values):
+        return jnp.sum(share * jnp.mean(values, axis=(1, 2, 3)))
+
+    loss = mean(smooth_error(error_x, width * stepper.dt)) + mean(smooth_error(error_v, width))
+    return loss, (mean(jnp.abs(error_x)) + mean(jnp.abs(error_v)), overflow)
 
 
 def gather_chunks(x, v, trajectory, start, length: int):
@@ -59,13 +66,37 @@ def gather_chunks(x, v, trajectory, start, length: int):
     return x[trajectory[:, None], times], v[trajectory[:, None], times]
 
 
-@eqx.filter_jit
-def train_step(data, unknowns, opt_state, rates: Rates, stepper, length, width):
-    """One step of the optimiser. A step whose gradient is not finite is left out and counted."""
+def gradients(data, unknowns: Unknowns, stepper: Stepper, length: int, width, mesh: Mesh | None):
+    """((loss, (error, overflow)), gradient) of a batch of chunks, by shares of it on the devices of `mesh`."""
     skeleton, x, v, trajectory, start = data
-    chunk = gather_chunks(x, v, trajectory, start, length)
-    gradient = eqx.filter_value_and_grad(chunk_loss, has_aux=True)
-    (loss, (error, overflow)), grads = gradient(unknowns, skeleton, stepper, *chunk, width)
+    size = len(start)
+    devices = 1 if mesh is None else mesh.size
+    # A batch that cannot be divided is filled up with chunks that have no share in it.
+    rows = np.arange(-(-size // devices) * devices)
+    share = jnp.asarray(np.where(rows < size, 1 / size, 0), x.dtype)
+    trajectory, start = (part[np.minimum(rows, size - 1)] for part in (trajectory, start))
+    arrays, static = eqx.partition((unknowns, skeleton, stepper), eqx.is_array)
+
+    def of_share(arrays, x, v, trajectory, start, share, width):
+        unknowns, skeleton, stepper = eqx.combine(arrays, static)
+        chunk = gather_chunks(x, v, trajectory, start, length)
+        gradient = eqx.filter_value_and_grad(chunk_loss, has_aux=True)
+        out, grads = gradient(unknowns, skeleton, stepper, *chunk, share, width)
+        grads = eqx.filter(grads, eqx.is_array)
+        return (out, grads) if mesh is None else jax.lax.psum((out, grads), AXIS)
+
+    inputs = (arrays, x, v, trajectory, start, share, width)
+    if mesh is None:
+        return of_share(*inputs)
+    everywhere, divided = PartitionSpec(), PartitionSpec(AXIS)
+    specs = (everywhere, everywhere, everywhere, divided, divided, divided, everywhere)
+    return jax.shard_map(of_share, mesh=mesh, in_specs=specs, out_specs=everywhere, check_vma=False)(*inputs)
+
+
+@eqx.filter_jit
+def train_step(data, unknowns, opt_state, rates: Rates, stepper, length, width, mesh: Mesh | None = None):
+    """One step of the optimiser. A step whose gradient is not finite is left out and counted."""
+    (loss, (error, overflow)), grads = gradients(data, unknowns, stepper, length, width, mesh)
     with jax.numpy_dtype_promotion("standard"):  # optax mixes its counters with floats
         updates, new_state = make_optimizer(rates).update(grads, opt_state, eqx.filter(unknowns, eqx.is_inexact_array))
     new = eqx.apply_updates(unknowns, updates).project()

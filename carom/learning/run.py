@@ -154,8 +154,14 @@ class RunFolder:
         if self._manager is None:
             import orbax.checkpoint as ocp  # slow to import, and only a training needs it
 
-            options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
-            self._manager = ocp.CheckpointManager((self.path / "checkpoints").absolute(), options=options)
+            # Of several processes the first alone writes, and waits for no other.
+            alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0})
+            options = ocp.CheckpointManagerOptions(
+                max_to_keep=2, enable_async_checkpointing=False, multiprocessing_options=alone, create=False
+            )
+            folder = (self.path / "checkpoints").absolute()
+            folder.mkdir(exist_ok=True)
+            self._manager = ocp.CheckpointManager(folder, options=options)
         return self._manager
 
     def save_checkpoint(self, epoch: int, state: Any) -> None:
@@ -204,11 +210,12 @@ def _leaves(tree: Any) -> dict[str, jax.Array]:
 
 def _finite(value: Any) -> Any:
     """`value` for JSON, with None for numbers that are not finite."""
+    if isinstance(value, np.generic | np.ndarray | jax.Array):
+        value = np.asarray(value).tolist()
     if isinstance(value, dict):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, str) or value is None or isinstance(value, bool):
         return value
     if isinstance(value, Iterable):
         return [_finite(v) for v in value]
-    number = value.item() if isinstance(value, np.generic | np.ndarray | jax.Array) else value
-    return number if np.isfinite(number) else None
+    return value if np.isfinite(value) else None

@@ -19,6 +19,7 @@ from carom.learning.baselines import BASELINES, new_baseline, physical_quantitie
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.data_checks import check_dataset
 from carom.learning.dataset import Chunks, Dataset, contact_flags
+from carom.learning.devices import all_devices, for_all, from_first, own
 from carom.learning.loss import gather_chunks, train_step, validate
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule
@@ -184,13 +185,15 @@ class _Training:
             smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from."
         )
         self.state = fresh_state(skeleton, config, train)
+        self.mesh = all_devices()
         restored = run.restore_checkpoint(self.state) if run is not None else None
         if run is not None and restored is not None:
             self.state = restored
             run.rewind_metrics(int(restored.epoch))
         elif run is not None and run.metrics():  # killed before its first checkpoint
             run.rewind_metrics(-1)
-        self.resumed = restored is not None
+        self.state = from_first(self.state)
+        self.resumed = bool(from_first(jnp.asarray(restored is not None)))
         self.stepper = Stepper(
             dt=jnp.asarray(train.dt),
             formulation=FORMULATIONS[config.model],
@@ -263,7 +266,7 @@ class _Training:
             self.log(0, shot.unknowns, refinement=number, val_loss=self.judge(shot.unknowns).mean)
         if better is not None and not (shot is not None and shot.fits):
             self.settle(better)
-            self.state = _keep_best(self.state, better[1].mean, 0)
+            self.state = from_first(_keep_best(self.state, better[1].mean, 0))
             if self.run is not None:
                 self.run.save_checkpoint(0, self.state)
         return shot
@@ -303,9 +306,8 @@ class _Training:
         done = (epoch - 1) / config.epochs
         width = jnp.asarray(config.loss_width * self.speed * LOSS_WIDTH_DECAY**done, self.dataset.train.x.dtype)
         rate = learning_rate_schedule(config, config.epochs * config.steps_per_epoch)
-        self.state, loss = _epoch(
-            self.state, epoch, self.trained, self.dataset.train, self.chunks, rate, self.stepper, width, config
-        )
+        data = (self.trained, self.dataset.train, self.chunks)
+        self.state, loss = _epoch(self.state, epoch, data, rate, self.stepper, width, config, self.mesh)
         self.loss = float(loss)
         now = self.judge(self.state.unknowns)
         if self.refines and epoch == self.refine_at:
@@ -384,9 +386,10 @@ def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):
     return gather_chunks(jnp.asarray(val.x), jnp.asarray(val.v), trajectory, start, config.states)
 
 
-def _epoch(state: TrainState, epoch: int, skeleton, train: Recording, chunks, rate, stepper, width, config):
+def _epoch(state: TrainState, epoch: int, data: tuple[System, Recording, Chunks], rate, stepper, width, config, mesh):
     """Learn from `chunks_per_epoch` new chunks. Their choice depends on seed and epoch alone, so that it can resume."""
     rng = np.random.default_rng((config.seed, 0, epoch))
+    skeleton, train, chunks = data
     x, v = jnp.asarray(train.x), jnp.asarray(train.v)
     unknowns, opt_state = state.unknowns, state.optimizer
     losses, overflow, skipped = [], state.overflow, state.skipped
@@ -394,16 +397,13 @@ def _epoch(state: TrainState, epoch: int, skeleton, train: Recording, chunks, ra
     done = (epoch - 1) * config.steps_per_epoch
     for count, first in enumerate(range(0, config.chunks_per_epoch, config.batch_size)):
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
-        data = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
-        unknowns, opt_state, loss, over, bad = train_step(
-            data,
-            unknowns,
-            opt_state,
-            Rates.of(config, rate(done + count), state.settled),
-            stepper,
-            config.states,
-            width,
-        )
+        batch = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
+        rates = Rates.of(config, rate(done + count), state.settled)
+        inputs = (batch, unknowns, opt_state, rates, stepper, config.states, width, mesh)
+        if jax.process_count() > 1:
+            unknowns, opt_state, loss, over, bad = own(train_step(*for_all(inputs)))
+        else:
+            unknowns, opt_state, loss, over, bad = train_step(*inputs)
         losses.append(loss)
         overflow, skipped = overflow + over, skipped + bad.astype(skipped.dtype)
     state = dataclasses.replace(

@@ -4,14 +4,22 @@ Figures are `matplotlib.figure.Figure` objects drawn by Agg; pyplot is never imp
 """
 
 import contextlib
+import contextvars
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import matplotlib.style
+import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import Collection
+from matplotlib.colors import to_rgb, to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.text import Text
 from matplotlib.ticker import LogLocator
 
 from carom.atomic import replacing
@@ -59,7 +67,6 @@ _STYLE = {
     "ytick.labelcolor": INK,
     "figure.facecolor": PAPER,
     "axes.facecolor": PAPER,
-    "savefig.facecolor": PAPER,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.8,
@@ -89,6 +96,62 @@ def figure_style() -> Iterator[None]:
         yield
 
 
+_DARK = {
+    INK: "#E6E8EB",
+    MUTED: "#9AA3AF",
+    FAINT: "#30363D",
+    SOLID: "#21262D",
+    PAPER: "#14181D",
+    TINT: "#274763",
+    TINT_EDGE: "#4F86B0",
+    HATCH: "#3D444D",
+    BLUE: "#4AA8E0",
+    VERMILLION: "#F0803C",
+    GREEN: "#2FC79A",
+    "#000000": "#E6E8EB",
+}
+"""What stands for each color on a dark background: the same hues, light enough to be read there."""
+_theme: contextvars.ContextVar[str] = contextvars.ContextVar("theme", default="light")
+
+
+@contextlib.contextmanager
+def theme(name: str) -> Iterator[None]:
+    """Figures written in this block are for a background that is "light" or "dark"; animations are always light.
+
+    **Raises:** `CaromError` for another name.
+    """
+    if name not in ("light", "dark"):
+        raise CaromError(f"theme must be 'light' or 'dark'; it was {name!r}.")
+    token = _theme.set(name)
+    try:
+        yield
+    finally:
+        _theme.reset(token)
+
+
+def _darken(figure: Figure) -> None:
+    """Exchange the colors of everything in a figure for those of the dark theme; their opacity stays."""
+    dark = {to_rgb(light): to_rgb(other) for light, other in _DARK.items()}
+
+    def exchanged(color):
+        rgba = np.atleast_2d(to_rgba_array(color))
+        return [(*dark.get(tuple(c[:3]), tuple(c[:3])), c[3]) for c in rgba.tolist()]
+
+    def recolor(artist: Artist, *names: str) -> None:
+        for name in names:
+            colors = exchanged(getattr(artist, f"get_{name}")())
+            if colors:
+                getattr(artist, f"set_{name}")(colors if isinstance(artist, Collection) else colors[0])
+
+    for artist in figure.findobj():
+        if isinstance(artist, Line2D):
+            recolor(artist, "color", "markerfacecolor", "markeredgecolor")
+        elif isinstance(artist, Text):
+            recolor(artist, "color")
+        elif isinstance(artist, Collection | Patch):
+            recolor(artist, "facecolor", "edgecolor")
+
+
 def new_figure(width: float, height: float, *, dpi: int = DPI, constrained: bool = True) -> Figure:
     """An empty figure of `width` by `height` inches, drawn by Agg."""
     figure = Figure((width, height), dpi=dpi, layout="constrained" if constrained else None)
@@ -97,14 +160,18 @@ def new_figure(width: float, height: float, *, dpi: int = DPI, constrained: bool
 
 
 def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write `figure` at its own dpi and return the path. Nothing half-written is ever seen there.
+    """Write `figure` at its own dpi, in the colors of the `theme`, and return the path.
+
+    Nothing half-written is ever seen there.
 
     **Raises:** `CaromError` for a path that does not end in .png, a missing folder, or one that
     cannot be written to.
     """
     path = checked_path(path, (".png",))
+    if _theme.get() == "dark":
+        _darken(figure)
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=figure.dpi, format="png")
+        figure.savefig(temporary, dpi=figure.dpi, format="png", facecolor=figure.get_facecolor())
     return path
 
 
