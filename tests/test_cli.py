@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 import carom
-from carom.cli.main import main
+from carom.cli.main import COMMANDS, main
 from carom.learning.run import RunFolder
 
 TINY = [
@@ -250,11 +250,75 @@ def test_bad_recordings_are_one_clear_line(capsys, tmp_path, fault):
     assert not (tmp_path / "run" / "model.carom").exists()
 
 
-def test_help_shows_every_default(capsys):
-    with pytest.raises(SystemExit) as stop:
-        command("learn", "--help")
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    for option in ("--data", "--resume", "--quick", "--epochs", "--learning-rate", "--model"):
+def help_of(*arguments: str) -> str:
+    """What a process of its own prints: help changes the classes that it is of."""
+    program = "import sys; from carom.cli.main import main; main(sys.argv[1:])"
+    environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(Path(carom.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, env=environment, check=True
+    )
+    return done.stdout
+
+
+def test_help_shows_every_default():
+    text = help_of("learn", "--help-all")
+    for option in ("--data", "--resume", "--quick", "--epochs", "--learning-rate", "--model", "--process-count"):
         assert option in text
     assert f"(default: {carom.LearnConfig.epochs})" in " ".join(text.split())
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_help_fits_a_screen():
+    for name in COMMANDS:
+        text = help_of(name, "--help")
+        assert f"usage: carom {name}" in text
+        assert len(text.splitlines()) <= 50, name
+        assert name != "learn" or "--learning-rate" not in text
+
+
+def test_help_of_the_whole_loads_neither_jax_nor_matplotlib():
+    program = (
+        "import sys; from carom.cli.main import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'jax', 'matplotlib', 'diffrax'} & set(sys.modules)))"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(carom.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.splitlines()[-1] == "[]"
+    for name in COMMANDS:
+        assert f"• {name}" in done.stdout
+
+
+def test_an_error_has_a_traceback_only_if_asked_for(capsys):
+    assert "task must be one of" in refused(capsys, "learn", "cp4")
+    with pytest.raises(SystemExit) as stop:
+        command("--debug", "learn", "cp4")
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert said.splitlines()[-1].startswith("carom: task must be one of")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (PermissionError(13, "Permission denied", "runs/x"), 2, "runs/x: Permission denied"),
+        (OSError(28, "No space left on device"), 2, "No space left on device"),
+        (MemoryError(), 1, "out of memory"),
+        (RuntimeError("first line\nsecond line"), 1, "RuntimeError: first line"),
+    ],
+)
+def test_errors_that_nobody_wrote_a_text_for(capsys, monkeypatch, error, code, said):
+    def fail(self):
+        raise error
+
+    monkeypatch.setattr("carom.cli.doctor.Doctor.run", fail)
+    with pytest.raises(SystemExit) as stop:
+        command("doctor")
+    assert stop.value.code == code
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert said in lines[0]
+    assert len(lines) <= 2
+    assert ("--debug" in lines[-1]) == isinstance(error, RuntimeError)

@@ -36,12 +36,17 @@ class Evaluate:
     against: FolderPath = None
     """For recorded tosses: another run, to compare with toss by toss."""
 
+    dark: bool = False
+    """Draw the figures for a dark background."""
+
     def after_interrupt(self) -> str:
         """What to say when interrupted."""
         return "Nothing was changed."
 
     def run(self) -> None:
         """Do it."""
+        from carom.view.style import theme  # matplotlib is slow to import
+
         run = RunFolder.open(self.run_folder)
         config = run.read_json(CONFIG)
         name = config["task"]
@@ -64,7 +69,8 @@ class Evaluate:
         found = what_is_told(system, test, config, console)
         told = found and dataclasses.asdict(found)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
-        pictures(run, system, test, predicted)
+        with theme("dark" if self.dark else "light"):
+            pictures(run, system, test, predicted)
         console.print(property_table(system, truth))
         if found is not None:
             console.print(told_table(system, found))

@@ -17,6 +17,7 @@ from carom.contact.impulses import contact_model_of
 from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Dataset, trajectory_of
+from carom.learning.devices import is_first, start_processes
 from carom.learning.evaluate import evaluate, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.model_file import save_model
@@ -31,6 +32,10 @@ from carom.tasks import make_data_sets, noisy, task
 TEST_DATA = "test.h5"
 QUICK = {"trajectories": 100, "epochs": 20}
 """What `--quick` makes smaller, where it is not set by hand."""
+
+
+COMMON = ("model", "epochs", "contact_model", "chunk_length", "seed")
+"""Options of `LearnConfig` that most users want."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +65,12 @@ class Learn:
     """Standard deviation of errors on simulated data to learn from (rad and rad/s for pendulums, else m and m/s)."""
     quick: bool = False
     """A small training of one minute or so after compilation, to try things out: few trajectories and epochs."""
+    coordinator: str = ""
+    """HOST:PORT of process 0, to train in several processes: each is started with the same options and its number."""
+    process_count: int = 1
+    """Number of processes that train together."""
+    process_id: int = 0
+    """Number of this process, from 0."""
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
     tosses: TossConfig = dataclasses.field(default_factory=TossConfig)
 
@@ -70,7 +81,9 @@ class Learn:
     def run(self) -> None:
         """Do it."""
         command = self._quickened() if self.quick else self
-        command._run(Console())
+        if self.coordinator or self.process_count > 1:
+            start_processes(self.coordinator, self.process_count, self.process_id)
+        command._run(Console(quiet=not is_first()))
 
     def _quickened(self) -> "Learn":
         trajectories = QUICK["trajectories"] if self.trajectories == Learn.trajectories else self.trajectories
@@ -95,6 +108,9 @@ class Learn:
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
         if self.data is not None and can_learn_tosses(truth):
             self._run_tosses(console, truth)
+            return
+        if not is_first():
+            learn(truth, self._data(truth, console)[0], self.config, progress=False)
             return
         folder = RunFolder.choose(self.out, f"{self.task}-{self.config.model}", resume=self.resume)
         if not self.resume:
@@ -122,6 +138,7 @@ class Learn:
     def _run_tosses(self, console: Console, skeleton: System) -> None:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
         self.tosses.check()
+        require(self.process_count == 1, f"process_count must be 1 for recorded tosses; it was {self.process_count}.")
         folder = RunFolder.choose(self.out, f"{self.task}-tosses", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
@@ -223,6 +240,13 @@ class Learn:
         if not report.epochs:
             seconds = f"{report.seconds:.0f} s; Gauss-Newton steps were enough, no epoch was needed"
         console.print(f"Done ({seconds}). Everything is in {run.path}", soft_wrap=True, highlight=False)
+
+
+Learn.RARE = {  # pyright: ignore[reportAttributeAccessIssue]
+    Learn: ("data_contact_model", "data_noise", "coordinator", "process_count", "process_id"),
+    LearnConfig: tuple(f.name for f in dataclasses.fields(LearnConfig) if f.name not in COMMON),
+    TossConfig: tuple(f.name for f in dataclasses.fields(TossConfig)),
+}
 
 
 def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:

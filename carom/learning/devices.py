@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
+from jaxtyping import Float, Int
 
 from carom.checks import require
 
@@ -31,6 +32,9 @@ def start_processes(coordinator: str, count: int, number: int) -> None:
     require(0 <= number < count, f"process_id must be from 0 to {count - 1}, process_count - 1; it was {number}.")
     host, _, port = coordinator.rpartition(":")
     require(bool(host) and port.isdigit(), f"coordinator must be HOST:PORT; it was {coordinator!r}.")
+    # XLA compiles on a pool of as many threads as the machine has cores, and a client of several processes compiles
+    # from within that pool: on two cores it waits for itself forever (jaxlib 0.9.2). NPROC is what the pool goes by.
+    os.environ.setdefault("NPROC", str(max(8, os.cpu_count() or 1)))
     jax.distributed.initialize(coordinator, num_processes=count, process_id=number)
 
 
@@ -39,27 +43,33 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
-def all_devices() -> Mesh | None:
-    """A mesh of all devices of all processes; None where there is only one.
+def own_devices() -> Mesh | None:
+    """A mesh of the devices of this process; None where there is only one.
 
-    The environment variable CAROM_DEVICES is the number of devices of a single process to use at most.
+    The environment variable CAROM_DEVICES is the number of them to use at most.
     """
-    devices = jax.devices()
+    devices = jax.local_devices()
     most = os.environ.get("CAROM_DEVICES", "")
-    if most and jax.process_count() == 1:
+    if most:
         require(most.isdigit() and int(most) > 0, f"CAROM_DEVICES must be a positive number; it was {most!r}.")
         devices = devices[: int(most)]
     return Mesh(np.array(devices), (AXIS,)) if len(devices) > 1 else None
 
 
-def for_all(tree: Any) -> Any:
-    """Arrays as a program of several processes takes them: the same on each."""
-    return jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, tree)
+def shares(size: int, mesh: Mesh | None) -> tuple[Int[np.ndarray, " B"], Float[np.ndarray, " B"]]:
+    """Which of `size` chunks this process takes, and the share of each in the means of all.
+
+    A number that cannot be divided by that of devices is filled up with chunks that have no share.
+    """
+    processes, devices = jax.process_count(), 1 if mesh is None else mesh.size
+    each = -(-size // (processes * devices)) * devices
+    rows = jax.process_index() * each + np.arange(each)
+    return np.minimum(rows, size - 1), np.where(rows < size, 1 / size, 0.0)
 
 
-def own(tree: Any) -> Any:
-    """Arrays that are the same on all devices, as arrays of this process."""
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a.addressable_data(0))) if eqx.is_array(a) else a, tree)
+def sum_over_processes(tree: Any) -> Any:
+    """The sums over all processes of the arrays that each has."""
+    return jax.tree.map(lambda a: jnp.asarray(np.sum(a, axis=0), a.dtype), multihost_utils.process_allgather(tree))
 
 
 def from_first(tree: Any) -> Any:

@@ -7,7 +7,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from carom.learning.devices import AXIS
+from carom.learning.devices import AXIS, shares, sum_over_processes
 from carom.learning.models import Unknowns
 from carom.learning.optimizer import Rates, make_optimizer
 from carom.simulation.impact import Stepper
@@ -67,14 +67,11 @@ def gather_chunks(x, v, trajectory, start, length: int):
 
 
 def gradients(data, unknowns: Unknowns, stepper: Stepper, length: int, width, mesh: Mesh | None):
-    """((loss, (error, overflow)), gradient) of a batch of chunks, by shares of it on the devices of `mesh`."""
-    skeleton, x, v, trajectory, start = data
-    size = len(start)
-    devices = 1 if mesh is None else mesh.size
-    # A batch that cannot be divided is filled up with chunks that have no share in it.
-    rows = np.arange(-(-size // devices) * devices)
-    share = jnp.asarray(np.where(rows < size, 1 / size, 0), x.dtype)
-    trajectory, start = (part[np.minimum(rows, size - 1)] for part in (trajectory, start))
+    """((loss, (error, overflow)), gradient) of chunks `(trajectory, start, share)`, by shares on the devices of `mesh`.
+
+    Their number must be one that can be divided.
+    """
+    skeleton, x, v, trajectory, start, share = data
     arrays, static = eqx.partition((unknowns, skeleton, stepper), eqx.is_array)
 
     def of_share(arrays, x, v, trajectory, start, share, width):
@@ -93,10 +90,35 @@ def gradients(data, unknowns: Unknowns, stepper: Stepper, length: int, width, me
     return jax.shard_map(of_share, mesh=mesh, in_specs=specs, out_specs=everywhere, check_vma=False)(*inputs)
 
 
+def train_step(data, unknowns, opt_state, rates: Rates, stepper, length: int, width, mesh: Mesh | None = None):
+    """One step of the optimiser on chunks `(trajectory, start)`. A step whose gradient is not finite is left out.
+
+    Of several processes each takes a share of the chunks, and adds up what all have found.
+    """
+    skeleton, x, v, trajectory, start = data
+    rows, share = shares(len(start), mesh)
+    chunks = (skeleton, x, v, trajectory[rows], start[rows], jnp.asarray(share, x.dtype))
+    if jax.process_count() == 1:
+        return _step(chunks, unknowns, opt_state, rates, stepper, length, width, mesh)
+    found = sum_over_processes(_gradients(chunks, unknowns, stepper, length, width, mesh))
+    return _updated(found, unknowns, opt_state, rates)
+
+
+_gradients = eqx.filter_jit(gradients)
+
+
 @eqx.filter_jit
-def train_step(data, unknowns, opt_state, rates: Rates, stepper, length, width, mesh: Mesh | None = None):
-    """One step of the optimiser. A step whose gradient is not finite is left out and counted."""
-    (loss, (error, overflow)), grads = gradients(data, unknowns, stepper, length, width, mesh)
+def _step(chunks, unknowns, opt_state, rates: Rates, stepper, length, width, mesh: Mesh | None):
+    return _update(gradients(chunks, unknowns, stepper, length, width, mesh), unknowns, opt_state, rates)
+
+
+@eqx.filter_jit
+def _updated(found, unknowns, opt_state, rates: Rates):
+    return _update(found, unknowns, opt_state, rates)
+
+
+def _update(found, unknowns, opt_state, rates: Rates):
+    (loss, (error, overflow)), grads = found
     with jax.numpy_dtype_promotion("standard"):  # optax mixes its counters with floats
         updates, new_state = make_optimizer(rates).update(grads, opt_state, eqx.filter(unknowns, eqx.is_inexact_array))
     new = eqx.apply_updates(unknowns, updates).project()

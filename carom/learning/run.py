@@ -202,10 +202,13 @@ class RunFolder:
             self._manager = None
 
 
-def _leaves(tree: Any) -> dict[str, jax.Array]:
-    """The arrays of a tree by their number. Those without elements, which orbax refuses, are left out."""
+def _leaves(tree: Any) -> dict[str, np.ndarray]:
+    """The arrays of a tree by their number. Those without elements, which orbax refuses, are left out.
+
+    NumPy's: of several processes the first alone writes, which orbax refuses to do with arrays of JAX.
+    """
     leaves = enumerate(jax.tree.leaves(eqx.filter(tree, eqx.is_array)))
-    return {f"{k:04d}": leaf for k, leaf in leaves if leaf.size}
+    return {f"{k:04d}": np.asarray(leaf) for k, leaf in leaves if leaf.size}
 
 
 def _finite(value: Any) -> Any:

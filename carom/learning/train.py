@@ -19,7 +19,7 @@ from carom.learning.baselines import BASELINES, new_baseline, physical_quantitie
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.data_checks import check_dataset
 from carom.learning.dataset import Chunks, Dataset, contact_flags
-from carom.learning.devices import all_devices, for_all, from_first, own
+from carom.learning.devices import from_first, own_devices
 from carom.learning.loss import gather_chunks, train_step, validate
 from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
 from carom.learning.optimizer import Rates, fresh_optimizer, learning_rate_schedule
@@ -185,7 +185,7 @@ class _Training:
             smooth + impact > 0, "the training data have no chunk that starts without contact: nothing to learn from."
         )
         self.state = fresh_state(skeleton, config, train)
-        self.mesh = all_devices()
+        self.mesh = own_devices()
         restored = run.restore_checkpoint(self.state) if run is not None else None
         if run is not None and restored is not None:
             self.state = restored
@@ -399,11 +399,9 @@ def _epoch(state: TrainState, epoch: int, data: tuple[System, Recording, Chunks]
         trajectory, start = (part[first : first + config.batch_size] for part in drawn)
         batch = (skeleton, x, v, jnp.asarray(trajectory), jnp.asarray(start))
         rates = Rates.of(config, rate(done + count), state.settled)
-        inputs = (batch, unknowns, opt_state, rates, stepper, config.states, width, mesh)
-        if jax.process_count() > 1:
-            unknowns, opt_state, loss, over, bad = own(train_step(*for_all(inputs)))
-        else:
-            unknowns, opt_state, loss, over, bad = train_step(*inputs)
+        unknowns, opt_state, loss, over, bad = train_step(
+            batch, unknowns, opt_state, rates, stepper, config.states, width, mesh
+        )
         losses.append(loss)
         overflow, skipped = overflow + over, skipped + bad.astype(skipped.dtype)
     state = dataclasses.replace(
