@@ -7,7 +7,7 @@ import tyro
 
 TaskName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-ContactModelName = Annotated[str, tyro.conf.arg(metavar="{cm,cmr,lcp,speed}")]
+ContactModelName = Annotated[str, tyro.conf.arg(metavar="{cm,cmr,lcp,coulomb}")]
 CompensationSteps = float | Literal["auto"] | None
 FilePath = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 FolderPath = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")]

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "lineax", "optax", "orbax-checkpoint", "numpy", "h5py", "tyro")
-EXTRAS = ("viser", "mujoco", "optuna")
+EXTRAS = ("imageio-ffmpeg", "mujoco", "optuna")
 HANGS = ((0, 10, 0), (0, 11, 0))
 """From the first to the second: versions of JAX that wait forever on machines with few cores."""
 SOLVES_SIDE_BY_SIDE = (

@@ -24,6 +24,7 @@ COMMANDS = {
     "learn": ("learn", "Learn", "Learn masses, potential, friction and restitution of a task from trajectories."),
     "evaluate": ("evaluate", "Evaluate", "Measure a learned model, and draw what it predicts."),
     "simulate": ("simulate", "Simulate", "Simulate a task and write its trajectories to a file."),
+    "view": ("view", "View", "Show a run or a trajectory file, moving, in the browser; or save it."),
     "control": ("control", "ControlCommand", "Find start or forces that bring a system where it should go."),
     "import": ("import_data", "Import", "Turn recorded poses of a tossed body into a trajectory file."),
     "reproduce": ("reproduce", "Reproduce", "Learn and measure what a table of the paper has."),

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.patches import Polygon
 
 from carom.contact.boxes import CornerPlane
-from carom.contact.candidates import DiskDisk, DiskPlane
+from carom.contact.candidates import DiskDisk, DiskPlane, RimPlane
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.constraints import Distance, Joint, Tether
 from carom.simulation.rollout import Trajectory
@@ -21,6 +21,8 @@ from carom.view.style import BLUE, HATCH, INK, MUTED, ORANGE, PAPER, SOLID, TINT
 
 FAR = 1e6
 """What is farther away (m) is lost."""
+RIM = 24
+"""Lines around a wheel."""
 RING_FRAMES = 10
 """For how many frames a new contact flashes."""
 AZIMUTH, ELEVATION = np.radians(-60), np.radians(20)
@@ -72,6 +74,15 @@ def lines_of(system: System) -> Lines:
             ends = [unit[center] * (1 - np.sum(corner)) + corner @ unit[axes] for corner in corners]
             weights.append(ends)
             offset.append([zero, zero])
+    for index in _wheels(system):
+        center, (first, second) = system.table.center[index], list(system.table.axes[index])[:2]
+        radius, turn = float(system.bodies[index].radius), np.linspace(0, 2 * np.pi, RIM + 1)
+        rim = [
+            unit[center] * (1 - radius * (c + s)) + radius * (c * unit[first] + s * unit[second])
+            for c, s in zip(np.cos(turn), np.sin(turn), strict=True)
+        ]
+        weights += [list(pair) for pair in pairwise(rim)]
+        offset += [[zero, zero]] * RIM
     for index, (body, center) in enumerate(zip(system.bodies, system.table.center, strict=True)):
         if isinstance(body, RigidBody) and index not in boxes:
             # A turning disk shows one spoke, a body in 3D its three axes.
@@ -95,6 +106,11 @@ def _boxes(system: System) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         for contact in corners
         for body in contact.bodies
     }
+
+
+def _wheels(system: System) -> list[int]:
+    """The bodies that touch with a rim, about their third axis."""
+    return sorted({body for contact in system.contacts if isinstance(contact, RimPlane) for body in contact.bodies})
 
 
 def _edges(dim: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -141,7 +157,7 @@ def walls_of(system: System) -> list[Wall]:
     """Each plane once."""
     found: dict[tuple, Wall] = {}
     for contact in system.contacts:
-        if isinstance(contact, DiskPlane | CornerPlane):
+        if isinstance(contact, DiskPlane | CornerPlane | RimPlane):
             wall = Wall(np.asarray(contact.point, float), np.asarray(contact.normal, float))
             key = (*wall.normal.round(9), round(float(wall.point @ wall.normal), 9))
             found.setdefault(key, wall)
@@ -151,11 +167,23 @@ def walls_of(system: System) -> list[Wall]:
 def box_of(system: System, trajectory: Trajectory, anchors: np.ndarray) -> np.ndarray:
     """Lower and upper corner (2, d) of all that the trajectory reaches."""
     x = positions_of(trajectory, FAR)[:, list(system.table.center)]
+    return box_of_points(system, x.reshape(-1, system.dim), anchors)
+
+
+def outlined_bodies(system: System) -> set[int]:
+    """The bodies whose lines are all there is to see: boxes and wheels."""
+    return {*_boxes(system), *_wheels(system)}
+
+
+def box_of_points(system: System, centers: np.ndarray, anchors: np.ndarray | None = None) -> np.ndarray:
+    """Lower and upper corner (2, d) of all bodies whose centers (B T, d) go through these places, body by body."""
+    anchors = lines_of(system).anchors if anchors is None else anchors
     radii = np.array(system.radii, float)[:, None]
     for body, (half, middle) in _boxes(system).items():
         radii[body] = np.linalg.norm(half + np.abs(middle))
+    x = centers.reshape(-1, len(radii), system.dim)
     reached = np.concatenate([(x - radii).reshape(-1, system.dim), (x + radii).reshape(-1, system.dim), anchors])
-    reached = reached[np.isfinite(reached).all(axis=1)]
+    reached = reached[np.isfinite(reached).all(axis=1) & (np.abs(reached) < FAR).all(axis=1)]
     return np.array([reached.min(axis=0), reached.max(axis=0)])
 
 
