@@ -21,7 +21,7 @@ def report_of(cell: Cell, value: float) -> dict:
     """A report of a job in which every quantity and error is `value`."""
     filled = {"friction": [value] * 40, "restitution": [value] * 40, "mass_ratio": [value] * 12}
     provenance = {"digest": "x", "seconds": 60.0, "carom": "0", "jax": "0"}
-    errors = {name: {"trajectory_error": value} for name in ("cm", "lcp")}
+    errors = {name: {"trajectory_error": value, "bounded_error": 0.75} for name in ("cm", "lcp")}
     curve = {name: {"mean": [0.0, value], "ci95": [0.0, value / 2], "median": [0.0, value]} for name in CURVES}
     told = {name: [{"standard_error": value / 10}] * 40 for name in ("friction", "restitution")}
     return {
@@ -128,6 +128,14 @@ def test_other_readings_are_shown_but_do_not_count():
     models = {job.contact_model for job in jobs if job.data == "lcp" and job.task == "cp3"}
     assert models == {"cm", "coulomb", "lcp"}
     assert {job.contact_model for job in jobs if job.task == "cp3-e"} == {"cm"}
+
+
+def test_an_error_that_is_not_finite_is_shown_in_its_bounded_form():
+    wanted = table("s10")
+    job = wanted.jobs(1)[1]
+    content = collect(wanted, {job: report_of(wanted.cells[1], float("inf"))}, seeds=1, quick=False)
+    assert content["cells"][1]["verdict"] == "worse"
+    assert "not finite (bounded: 0.75)" in markdown(content)
 
 
 def test_standard_errors_and_pictures(tmp_path):

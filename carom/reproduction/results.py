@@ -85,7 +85,11 @@ def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, qui
         done = [reports[job] for job in jobs if job in reports]
         if done:
             errors = None if cell.read_error is None else [cell.read_error(report) for report in done]
-            cells.append(measured(cell, [cell.read(report) for report in done], errors))
+            entry = measured(cell, [cell.read(report) for report in done], errors)
+            if entry["carom"] is None and cell.read_bounded is not None:
+                bounded = [value for report in done if (value := cell.read_bounded(report)) is not None]
+                entry["bounded"] = float(np.mean(bounded)) if bounded else None
+            cells.append(entry)
         else:
             cells.append({**measured(dataclasses.replace(cell, job=None), []), "note": "not run yet"})
     runs = {job.name: report["provenance"] for job, report in reports.items()}
@@ -168,6 +172,11 @@ def _number(value: float | None) -> str:
     return f"{value:.2e}" if value and abs(value) < 1e-3 else f"{value:.5g}"
 
 
+def _without_number(cell: dict[str, Any]) -> str:
+    bounded = cell.get("bounded")
+    return cell["note"] if bounded is None else f"not finite (bounded: {_number(bounded)})"
+
+
 def markdown(content: dict[str, Any]) -> str:
     """The table as a page's section: a line a cell, with the paper's number, ours, errors and their ratio."""
     lines = [f"## {content['title']}", ""]
@@ -187,7 +196,7 @@ def markdown(content: dict[str, Any]) -> str:
             cell["column"],
             _number(cell["true"]),
             _number(cell["paper"]),
-            carom or cell["note"],
+            carom or _without_number(cell),
             _number(cell["paper_error"]),
             _number(cell["error"]),
             _number(cell["ratio"]),
