@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -322,3 +323,23 @@ def test_errors_that_nobody_wrote_a_text_for(capsys, monkeypatch, error, code, s
     assert said in lines[0]
     assert len(lines) <= 2
     assert ("--debug" in lines[-1]) == isinstance(error, RuntimeError)
+
+
+def test_a_program_to_start_from(tmp_path, capsys):
+    command("new", "mine.py")
+    assert "Written to mine.py" in capsys.readouterr().out
+    compile(Path("mine.py").read_text(), "mine.py", "exec")
+    assert "mine.py is there already" in refused(capsys, "new", "mine.py")
+    command("new", "mine.py", "--force")
+    assert "file must end in .py" in refused(capsys, "new", "mine.txt")
+    assert "does not exist" in refused(capsys, "new", "nowhere/mine.py")
+
+
+@pytest.mark.slow
+def test_the_program_to_start_from_runs(tmp_path):
+    command("new", "mine.py")
+    environment = {**os.environ, "PYTHONPATH": str(Path(carom.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "mine.py"], capture_output=True, text=True, check=True, env=environment)
+    found = re.findall(r"restitution 1: (\S+) .* identified", done.stdout)
+    assert float(found[0]) == pytest.approx(0.5, abs=1e-3)
+    assert Path("motions.h5").exists()

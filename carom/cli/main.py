@@ -28,6 +28,7 @@ COMMANDS = {
     "control": ("control", "ControlCommand", "Find start or forces that bring a system where it should go."),
     "import": ("import_data", "Import", "Turn recorded poses of a tossed body into a trajectory file."),
     "reproduce": ("reproduce", "Reproduce", "Learn and measure what a table of the paper has."),
+    "new": ("new", "New", "Write a commented program to start a system of your own from."),
     "doctor": ("doctor", "Doctor", "Check versions, devices, the contact solver and gradients on this machine."),
 }
 """By name: module in `carom.cli`, class, and what it is for."""

@@ -39,6 +39,8 @@ class Reproduce:
     """Trainings at the same time, each a process."""
     only: str = ""
     """Only trainings whose name has this in it (cp3-e, chnn, seed0, ...); other cells stay as they are."""
+    collect: bool = False
+    """Train nothing: write the tables from the trainings that are finished."""
     quick: bool = False
     """A smoke run: the first two trainings of the table, few data and epochs; the numbers mean nothing."""
 
@@ -82,6 +84,7 @@ class Reproduce:
         )
         jobs = jobs[:2] if self.quick else jobs
         todo = [job for job in jobs if not (folder / job.name / "report.json").exists()]
+        todo = [] if self.collect else todo
         minutes = sum(MINUTES.get(job.task, 15.0) for job in todo) / self.workers
         console.print(
             f"{name}: {len(todo)} of {len(jobs)} trainings to do"
@@ -89,7 +92,7 @@ class Reproduce:
             highlight=False,
         )
         # Finished trainings that are not asked for now stay in the table.
-        finished = [job for job in every if job not in todo and (folder / job.name / "report.json").exists()]
+        finished = [job for job in every if (folder / job.name / "report.json").exists()]
         reports: dict[Job, Any] = {job: job.run(folder, quick=self.quick) for job in finished}
 
         def write() -> Path:
