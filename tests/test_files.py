@@ -500,7 +500,7 @@ def test_a_file_named_as_the_other_format(tmp_path, is_now, was):
     assert "name it by its format" in line
 
 
-@pytest.mark.parametrize("name", ["a", "a.csv", "a.npz.gz", ".npz"])
+@pytest.mark.parametrize("name", ["a", "a.txt", "a.npz.gz", ".npz"])
 def test_wrong_suffix(tmp_path, name):
     wanted = "the file must have a name that ends in .h5, .hdf5, .npz"
     (tmp_path / name).write_bytes(b"")

@@ -48,7 +48,7 @@ class Learn:
     task: TaskName
     """Name of the task: its geometry is known, all else is learned."""
     data: FilePath = None
-    """Trajectory file (.h5, .hdf5 or .npz) to learn from; without it, data are simulated."""
+    """Trajectory file (.h5, .hdf5, .npz or .csv) to learn from; without it, data are simulated."""
     val: FilePath = None
     """Trajectory file to validate on; without it, a tenth of the data."""
     test: FilePath = None

@@ -26,7 +26,7 @@ class Simulate:
     task: TaskName
     """Name of the task."""
     out: FilePath = None
-    """File to write (.h5, .hdf5 or .npz); by default TASK.h5."""
+    """File to write (.h5, .hdf5, .npz or .csv); by default TASK.h5."""
     run_folder: FolderPath = None
     """Use the model learned in this run folder in place of the true system."""
     initial: FilePath = None

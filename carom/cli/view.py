@@ -39,7 +39,7 @@ class View:
     """
 
     run_or_file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_OR_FILE")]
-    """Run folder of `carom learn`, or a trajectory file (.h5, .hdf5 or .npz)."""
+    """Run folder of `carom learn`, or a trajectory file (.h5, .hdf5, .npz or .csv)."""
     save: Path | None = None
     """Write a page (.html: one file that works offline), .gif or .mp4 instead of opening the browser."""
     trajectories: int = 4

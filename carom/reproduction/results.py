@@ -200,7 +200,7 @@ def markdown(content: dict[str, Any]) -> str:
             _number(cell["paper_error"]),
             _number(cell["error"]),
             _number(cell["ratio"]),
-            cell["verdict"] if cell["counted"] or not cell["verdict"] else f"({cell['verdict']})",
+            cell["verdict"] if cell.get("counted", True) or not cell["verdict"] else f"({cell['verdict']})",
         ]
         if told:
             row.insert(5, _number(cell.get("standard_error")))

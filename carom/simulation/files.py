@@ -1,6 +1,6 @@
-"""Trajectory files: HDF5 and NPZ, checked when they are read, written whole or not at all.
+"""Trajectory files: HDF5, NPZ and CSV, checked when they are read, written whole or not at all.
 
-Both formats hold, under the same names (attributes are 0-d arrays in NPZ):
+The first two hold, under the same names (attributes are 0-d arrays in NPZ):
 
     x, v        (trajectory, time, point, axis)     m, m/s
     time        (time,) or (trajectory, time)       s
@@ -10,7 +10,8 @@ Both formats hold, under the same names (attributes are 0-d arrays in NPZ):
     attributes  dt, units, task, source, carom_version, checksum
 
 `checksum` is a SHA-256 over everything else. It and all other attributes may be missing, and so may
-one of `time` and `dt`. Reading never unpickles and never follows a file into another one.
+one of `time` and `dt`.
+CSV is for data from elsewhere: see `csv_files.py`. Reading never unpickles and never follows a file into another one.
 """
 
 import hashlib
@@ -30,6 +31,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from carom.atomic import write_whole
 from carom.errors import CaromError
+from carom.simulation.csv_files import encode_csv, read_csv
 
 STEP_TOLERANCE = 1e-6
 """Largest difference of two time steps that count as equal, relative to the step."""
@@ -126,7 +128,7 @@ class Recording(eqx.Module):
 
 
 def load_recording(path: str | os.PathLike[str], *, task: str | None = None) -> Recording:
-    """Read a trajectory file: HDF5 if its name ends in .h5 or .hdf5, NPZ if in .npz.
+    """Read a trajectory file: HDF5 if its name ends in .h5 or .hdf5, NPZ if in .npz, CSV if in .csv.
 
     `task` is the name of the task that the file should hold; a file that names none passes.
 
@@ -154,7 +156,7 @@ def load_recording(path: str | os.PathLike[str], *, task: str | None = None) -> 
 
 
 def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
-    """Write a trajectory file: HDF5 if its name ends in .h5 or .hdf5, NPZ if in .npz.
+    """Write a trajectory file: HDF5 if its name ends in .h5 or .hdf5, NPZ if in .npz, CSV if in .csv.
 
     The file appears whole or not at all, and replaces an older one in one step. A process that is
     killed while it writes may leave a file `.carom-*.tmp` next to it, which can be deleted.
@@ -459,7 +461,12 @@ class _Format(NamedTuple):
 
 
 _HDF5 = _Format(_decode_hdf5, _encode_hdf5)
-_FORMATS = {".h5": _HDF5, ".hdf5": _HDF5, ".npz": _Format(_decode_npz, _encode_npz)}
+_FORMATS = {
+    ".h5": _HDF5,
+    ".hdf5": _HDF5,
+    ".npz": _Format(_decode_npz, _encode_npz),
+    ".csv": _Format(read_csv, encode_csv),
+}
 
 
 def _format(path: Path) -> _Format:
