@@ -61,7 +61,7 @@ def test_what_is_to_be_copied_works(page, tmp_path, monkeypatch, capsys):
     names: dict = {"__name__": "page"}
     exec(compile(blocks_of(page), page, "exec"), names)
     if page == "own-system.md":
-        assert (tmp_path / "balls.h5").exists()
+        assert (tmp_path / "balls.csv").exists()
         friction, restitution = names["report"].friction, names["report"].restitution
         assert friction[1] == pytest.approx(0.4, abs=1e-3)
         assert restitution[1] == pytest.approx(0.5, abs=1e-3)
