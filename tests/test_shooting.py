@@ -84,6 +84,8 @@ def test_noise_is_measured_against_what_a_step_moves(system, exact, start):
         assert is_noisy(errors, exact) == (sd == NOISE)
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_properties_and_potential_from_noisy_states(system, dataset, start):
     shot = estimate(start, system, STEPPER, dataset, seed=0)
     assert shot is not None
@@ -93,6 +95,7 @@ def test_properties_and_potential_from_noisy_states(system, dataset, start):
     np.testing.assert_allclose(shot.unknowns.potential.slope, [[0.0, 9.81]], atol=0.1)
 
 
+@pytest.mark.slow
 def test_estimated_starts_are_nearer_to_the_truth_than_recorded_ones(system, exact, dataset, start):
     windows = choose_windows(dataset.train, system, seed=0)
     shooting = Shooting(system, STEPPER, windows, window_directions(start, system, windows))
@@ -106,6 +109,7 @@ def test_estimated_starts_are_nearer_to_the_truth_than_recorded_ones(system, exa
     assert after < 0.5 * before
 
 
+@pytest.mark.slow
 def test_what_noisy_states_tell(system, dataset, start):
     shot = estimate(start, system, STEPPER, dataset, seed=0)
     assert shot is not None
@@ -124,6 +128,7 @@ def test_exact_data_need_no_estimated_starts(system, exact, start):
     assert estimate(truth, system, STEPPER, data, seed=0) is None
 
 
+@pytest.mark.slow
 def test_learning_says_that_starts_were_estimated(system, dataset):
     learned, report = carom.learn(system, dataset, CONFIG, progress=False)
     assert report.starts_estimated

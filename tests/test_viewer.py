@@ -56,6 +56,7 @@ def test_an_impulse_is_what_changed_the_momentum(system, bounce):
     assert motion.impulse_size[k] == pytest.approx(np.linalg.norm(change))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cp3", "gyro"])
 def test_impulses_of_joined_bodies_point_out_of_the_wall(name):
     system = carom.task(name)
