@@ -1,6 +1,7 @@
 """The contact models: against references and each other, derivatives, and how they are chosen."""
 
 import dataclasses
+import re
 
 import equinox as eqx
 import jax
@@ -389,7 +390,8 @@ def test_a_saved_model_has_its_contact_model_again(tmp_path, cp3):
         carom.save_model(path, cp3.with_contact_model(model))
         again = carom.load_model(path).contact_model
         assert eqx.tree_equal(again, model)
-    header, _, payload = path.read_bytes().partition(b'"name": "lcp"')
+    data = re.sub(rb', "header_sha256": "[0-9a-f]+"', b"", path.read_bytes())
+    header, _, payload = data.partition(b'"name": "lcp"')
     path.write_bytes(header + b'"name": "new"' + payload)
     with refused("was learned with the contact model 'new'"):
         carom.load_model(path)

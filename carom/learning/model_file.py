@@ -63,7 +63,19 @@ def save_model(
             "depth": network.depth,
             "dtype": str(network.layers[0].weight.dtype),
         }
+    header["header_sha256"] = _header_checksum(header)
     write_whole(Path(path), MAGIC + json.dumps(header).encode() + b"\n" + payload)
+
+
+NEEDED = {"task", "formulation", "points", "dim", "network", "sha256"}
+KEYS = NEEDED | {"compensation_steps", "contact_model", "potential", "baseline", "header_sha256"}
+"""What a header may have; older files lack some."""
+
+
+def _header_checksum(header: dict[str, Any]) -> str:
+    """SHA-256 over a header without its own."""
+    rest = {name: value for name, value in header.items() if name != "header_sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def read_model_header(path: str | Path) -> dict[str, Any]:
@@ -132,8 +144,13 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes]:
         raise CaromError(
             f"the model {path} is damaged: its header cannot be read. Use a copy, or learn again."
         ) from error
+    sound = isinstance(header, dict) and NEEDED <= header.keys() <= KEYS
     require(
-        hashlib.sha256(payload).hexdigest() == header.get("sha256"),
+        sound and header.get("header_sha256", _header_checksum(header)) == _header_checksum(header),
+        f"the model {path} is damaged: its header is not as it was written. Use a copy, or learn again.",
+    )
+    require(
+        hashlib.sha256(payload).hexdigest() == header["sha256"],
         f"the model {path} is damaged: its checksum does not match. Use a copy, or learn again.",
     )
     return header, payload
