@@ -37,6 +37,7 @@ LENGTH = 24
 RUN_IN = 12
 """States before the first contact of a window, if there are so many: they tell its start, whatever the contact does."""
 LEAST_RUN_IN = 6
+"""Contacts after fewer are not looked at."""
 COUNT = 600
 """Most windows."""
 BATCH = 64
@@ -199,11 +200,11 @@ class Shooting:
         self.z = np.stack([windows.x[:, 0], windows.v[:, 0]], axis=1)
         count, length = windows.x.shape[:2]
         self.before = np.arange(length) < windows.run_in[:, None]
-        self.errors = self.scale = np.ones(2 * windows.x[0, 0].size)
-        self.residual = np.zeros((count, length, len(self.scale)))
+        self.errors = np.ones(2 * windows.x[0, 0].size)
+        self.residual = np.zeros((count, length, len(self.errors)))
 
     def _batches(self, *arrays):
-        """Batches of one size, and how many of the last one's rows are new."""
+        """Starts, states and `arrays` in batches of one size; the last one is filled up with its last window."""
         count = len(self.windows.x)
         for first in range(0, count, BATCH):
             rows = np.arange(first, first + BATCH).clip(max=count - 1)
@@ -255,20 +256,8 @@ class Shooting:
 
     def reduced(self, unknowns: Unknowns, *, redescend: bool) -> _Reduced:
         """See `_Reduced`."""
-        parts = [
-            _reduced(
-                unknowns,
-                self.skeleton,
-                self.stepper,
-                jnp.asarray(self.features),
-                jnp.asarray(self.errors),
-                z,
-                x,
-                v,
-                jnp.asarray(redescend),
-            )
-            for z, x, v in self._batches()
-        ]
+        held = (self.skeleton, self.stepper, jnp.asarray(self.features), jnp.asarray(self.errors))
+        parts = [_reduced(unknowns, *held, z, x, v, jnp.asarray(redescend)) for z, x, v in self._batches()]
         return jax.tree.map(lambda *a: np.concatenate([np.asarray(p) for p in a])[: len(self.z)], *parts)
 
     def states(self) -> Recording:
