@@ -11,7 +11,7 @@ from systems import refused
 import carom
 from carom.cli.main import main
 from carom.reproduction.jobs import Job
-from carom.reproduction.results import collect, markdown, measured, page, pictures, write
+from carom.reproduction.results import collect, known, markdown, measured, page, pictures, write, written
 from carom.reproduction.tables import BUILDERS, Cell, paper, table
 from carom.tasks import noisy
 from carom.tasks.pendulums import chain_angles, chain_state
@@ -96,6 +96,37 @@ def test_the_mean_and_its_interval():
     assert found["ci95"] == pytest.approx(1.96 * 1e-3 / np.sqrt(3))
     assert found["ratio"] == pytest.approx(0.5)
     assert found["verdict"] == "met"
+
+
+def test_what_a_written_table_has_stays(tmp_path):
+    wanted = table("s6")
+    cell = wanted.cells[0]
+    assert cell.job is not None
+    jobs = [dataclasses.replace(cell.job, seed=seed) for seed in range(3)]
+    report = report_of(cell, 0.5)
+    report["provenance"]["digest"] = jobs[0].digest()
+    stale = report_of(cell, 0.6)  # of other settings: its digest is "x"
+    earlier = collect(wanted, {jobs[0]: report, jobs[1]: stale}, seeds=3, quick=False)
+    write(earlier, tmp_path)
+    earlier = written("s6", tmp_path)
+    assert earlier is not None
+    assert list(known(wanted, earlier, 3, quick=False)) == [jobs[0]]
+    assert known(wanted, earlier, 3, quick=True) == {}
+    again = collect(wanted, {jobs[2]: report_of(cell, 0.8)}, seeds=3, quick=False, earlier=earlier)
+    assert again["cells"][0]["carom"] == pytest.approx(0.65)
+    assert list(again["cells"][0]["by_seed"]) == ["0", "2"]
+    assert set(again["runs"]) == {jobs[0].name, jobs[2].name}
+    # A training that is there now counts, not what was written of it.
+    anew = collect(wanted, {jobs[0]: report_of(cell, 0.7)}, seeds=3, quick=False, earlier=earlier)
+    assert anew["cells"][0]["by_seed"]["0"]["value"] == 0.7
+
+
+def test_a_damaged_table_is_refused(tmp_path):
+    assert written("s6", tmp_path) is None
+    for text in ("{", "[]", "{}"):
+        (tmp_path / "s6.json").write_text(text)
+        with refused("s6.json is not a table that carom wrote"):
+            written("s6", tmp_path)
 
 
 def test_tables_are_written_with_what_is_there(tmp_path):

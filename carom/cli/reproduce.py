@@ -20,8 +20,8 @@ MINUTES = {"bp5-e": 1.5, "bp5": 1.5, "bd5": 4, "cp3-e": 0.7, "cp3": 0.7, "gyro-e
 class Reproduce:
     """Learn what a table of the paper's supplement needs, measure it, and write results/TABLE.json and TABLE.md.
 
-    Finished trainings are skipped, stopped ones go on. `all`: every table; `page`: docs/results.md from what there is,
-    and the pictures of figure3.
+    Finished trainings, and those that the written table has already, are skipped; stopped ones go on. `all`: every
+    table; `page`: docs/results.md from what there is, and the pictures of figure3.
     """
 
     table: Annotated[
@@ -83,7 +83,10 @@ class Reproduce:
             f"{self.only!r}.",
         )
         jobs = jobs[:2] if self.quick else jobs
-        todo = [job for job in jobs if not (folder / job.name / "report.json").exists()]
+        into = self.results / "quick" if self.quick else self.results
+        earlier = results.written(name, into)
+        known = {} if earlier is None else results.known(wanted, earlier, seeds, quick=self.quick)
+        todo = [job for job in jobs if not (folder / job.name / "report.json").exists() and job not in known]
         todo = [] if self.collect else todo
         minutes = sum(MINUTES.get(job.task, 15.0) for job in todo) / self.workers
         console.print(
@@ -96,8 +99,8 @@ class Reproduce:
         reports: dict[Job, Any] = {job: job.run(folder, quick=self.quick) for job in finished}
 
         def write() -> Path:
-            content = results.collect(wanted, reports, seeds=seeds, quick=self.quick)
-            return results.write(content, self.results / "quick" if self.quick else self.results)
+            content = results.collect(wanted, reports, seeds=seeds, quick=self.quick, earlier=earlier)
+            return results.write(content, into)
 
         def keep(job: Job, report: dict[str, Any]) -> None:
             reports[job] = report

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from carom.atomic import write_whole
+from carom.checks import require
+from carom.errors import CaromError
 from carom.reproduction.jobs import Job
 from carom.reproduction.tables import BUILDERS, Cell, Table
 from carom.tasks import find_task
@@ -74,30 +76,43 @@ def measured(cell: Cell, values: list[float | None], errors: list[float | None] 
     return out
 
 
-def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, quick: bool) -> dict[str, Any]:
-    """All cells of a table, by the seeds that have a report, with where they come from."""
+def collect(
+    table: Table,
+    reports: dict[Job, dict[str, Any]],
+    *,
+    seeds: int,
+    quick: bool,
+    earlier: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """All cells of a table, by the seeds that have a report, with where they come from.
+
+    `earlier`: the table as it was written before. What it has of trainings with the same settings stays, where there is
+    no report of them now.
+    """
+    kept = {} if earlier is None else known(table, earlier, seeds, quick=quick)
+    kept = {job: run for job, run in kept.items() if job not in reports}
+    before = {(cell["row"], cell["column"]): cell.get("by_seed", {}) for cell in (earlier or {}).get("cells", [])}
     cells = []
     for cell in table.cells:
         if cell.job is None:
             cells.append(measured(cell, []))
             continue
-        jobs = [dataclasses.replace(cell.job, seed=seed) for seed in range(seeds)]
-        done = [reports[job] for job in jobs if job in reports]
-        if done:
-            errors = None if cell.read_error is None else [cell.read_error(report) for report in done]
-            entry = measured(cell, [cell.read(report) for report in done], errors)
-            if entry["carom"] is None and cell.read_bounded is not None:
-                bounded = [value for report in done if (value := cell.read_bounded(report)) is not None]
-                entry["bounded"] = float(np.mean(bounded)) if bounded else None
-            cells.append(entry)
+        found = {}
+        for seed in range(seeds):
+            job = dataclasses.replace(cell.job, seed=seed)
+            if job in reports:
+                found[str(seed)] = _entry(cell, reports[job])
+            elif job in kept and str(seed) in (old := before.get((cell.row, cell.column), {})):
+                found[str(seed)] = old[str(seed)]
+        if found:
+            entry = measured(cell, _column(found, "value"), _column(found, "standard_error"))
+            bounded = [value for value in _column(found, "bounded") if value is not None]
+            if entry["carom"] is None and bounded:
+                entry["bounded"] = float(np.mean(bounded))
+            cells.append({**entry, "by_seed": found})
         else:
             cells.append({**measured(dataclasses.replace(cell, job=None), []), "note": "not run yet"})
-    runs = {job.name: report["provenance"] for job, report in reports.items()}
-    curves = [
-        {"row": cell.row, "column": cell.column, **_mean_over_seeds(cell.job, reports)}
-        for cell in table.cells
-        if table.over_time and cell.job is not None and any(_of(cell.job, job) for job in reports)
-    ]
+    curves = _curves(table, reports, earlier) if table.over_time else []
     return {
         "table": table.name,
         "title": table.title,
@@ -105,11 +120,48 @@ def collect(table: Table, reports: dict[Job, dict[str, Any]], *, seeds: int, qui
         "quick": quick,
         "cells": cells,
         "summary": summary(cells),
-        "runs": runs,
+        "runs": {job.name: report["provenance"] for job, report in reports.items()}
+        | {job.name: run for job, run in kept.items()},
         "commit": commit(),
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
         **({"over_time": curves} if curves else {}),
     }
+
+
+def known(table: Table, earlier: dict[str, Any], seeds: int, *, quick: bool) -> dict[Job, dict[str, Any]]:
+    """The trainings that a written table has, with the settings of today: each with where it comes from."""
+    if earlier["quick"] != quick:
+        return {}
+    runs = earlier["runs"]
+    return {
+        job: runs[job.name]
+        for job in table.jobs(seeds)
+        if job.name in runs and runs[job.name]["digest"] == job.digest(quick)
+    }
+
+
+def _entry(cell: Cell, report: dict[str, Any]) -> dict[str, float | None]:
+    """What one training says of a cell; None for a number that is not finite."""
+    readers = {"value": cell.read, "standard_error": cell.read_error, "bounded": cell.read_bounded}
+    found = {name: read(report) for name, read in readers.items() if read is not None}
+    return {name: None if value is None or not np.isfinite(value) else float(value) for name, value in found.items()}
+
+
+def _column(by_seed: dict[str, dict[str, float | None]], name: str) -> list[float | None]:
+    return [entry.get(name) for entry in by_seed.values()]
+
+
+def _curves(table: Table, reports: dict[Job, dict[str, Any]], earlier: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """Errors over time of a table's trainings: of those with a report, else as they were written before."""
+    before = {(curve["row"], curve["column"]): curve for curve in (earlier or {}).get("over_time", [])}
+    curves = []
+    for cell in table.cells:
+        place = (cell.row, cell.column)
+        if cell.job is not None and any(_of(cell.job, job) for job in reports):
+            curves.append({"row": cell.row, "column": cell.column, **_mean_over_seeds(cell.job, reports)})
+        elif place in before:
+            curves.append(before[place])
+    return curves
 
 
 def _of(job: Job, other: Job) -> bool:
@@ -155,6 +207,24 @@ def commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return out.stdout.strip()
+
+
+def written(name: str, folder: Path) -> dict[str, Any] | None:
+    """The table of this name in a folder of results, if it is there.
+
+    **Raises:** `CaromError` if the file is damaged.
+    """
+    path = folder / f"{name}.json"
+    if not path.exists():
+        return None
+    try:
+        content = json.loads(path.read_text())
+        require(set(content) >= {"cells", "runs", "quick"}, "incomplete")
+    except (ValueError, TypeError) as error:
+        raise CaromError(
+            f"{path} is not a table that carom wrote ({error}): restore it, or remove it to measure anew."
+        ) from error
+    return content
 
 
 def write(content: dict[str, Any], folder: Path) -> Path:
