@@ -13,7 +13,7 @@ from rich.table import Table
 
 import carom
 from carom.cli.arguments import FolderPath
-from carom.cli.runs import learned_system
+from carom.cli.systems import learned_system
 from carom.learning.run import REPORT, RunFolder
 from carom.tasks import task
 from carom.tasks.control import AS_GIVEN, Control, ControlConfig, ControlReport, Physics, optimize, perform

@@ -7,7 +7,8 @@ from rich.console import Console
 
 from carom.checks import require
 from carom.cli.arguments import FilePath, FolderPath, RunPath
-from carom.cli.learn import TEST_DATA, pictures, what_is_told
+from carom.cli.outcome import TEST_DATA, pictures, what_is_told
+from carom.cli.systems import chosen_by
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import measure, nominal_width, other_run
 from carom.learning.evaluate import evaluate
@@ -15,7 +16,6 @@ from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
 from carom.simulation.files import load_recording
 from carom.system import System
-from carom.tasks import task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,19 +49,19 @@ class Evaluate:
 
         run = RunFolder.open(self.run_folder)
         config = run.read_json(CONFIG)
-        name = config["task"]
-        truth = task(name)
+        chosen = chosen_by(run)
+        truth = chosen.system
         if config.get("tosses") is not None:
             self._evaluate_tosses(run, truth)
             return
         require(self.against is None, "against compares runs that learned from recorded tosses; this one did not.")
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, truth)
-        test = load_recording(self.data or run.path / TEST_DATA, task=name)
+        test = load_recording(self.data or run.path / TEST_DATA, task=chosen.task)
         measures, predicted = evaluate(
             system,
             test,
-            truth=truth,
+            truth=chosen.truth,
             formulation=header["formulation"],
             compensation_steps=header["compensation_steps"],
         )
@@ -71,7 +71,7 @@ class Evaluate:
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         with theme("dark" if self.dark else "light"):
             pictures(run, system, test, predicted)
-        console.print(property_table(system, truth))
+        console.print(property_table(system, truth, config["task"] if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))
         console.print(evaluation_table(measures))

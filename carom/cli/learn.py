@@ -1,35 +1,39 @@
 """`carom learn TASK`: make or read data, train, and write a run folder with tables and pictures."""
 
 import dataclasses
+import hashlib
 import time
-from typing import Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
 
 import jax
 import numpy as np
+import tyro
 from rich.console import Console
 
 import carom
+from carom.atomic import write_whole
 from carom.checks import require
-from carom.cli.arguments import ContactModelName, FilePath, FolderPath, TaskName
+from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
+from carom.cli.outcome import TEST_DATA, pictures, what_is_told
+from carom.cli.systems import Chosen, choose, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import learn_and_measure
 from carom.contact.impulses import contact_model_of
-from carom.learning.baselines import BASELINES
+from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS, LearnConfig
-from carom.learning.dataset import Dataset, trajectory_of
+from carom.learning.dataset import Dataset
 from carom.learning.devices import is_first, start_processes
-from carom.learning.evaluate import evaluate, state_errors
-from carom.learning.identify import MOST_POINTS, Identification, identify
+from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
-from carom.learning.run import MODEL, REPORT, TRUTH, RunFolder
+from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.learning.tosses import TossConfig, can_learn_tosses
 from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
-from carom.simulation.rollout import Trajectory
 from carom.system import System
-from carom.tasks import make_data_sets, noisy, task
+from carom.tasks import make_data_sets, noisy
 
-TEST_DATA = "test.h5"
 QUICK = {"trajectories": 100, "epochs": 20}
 """What `--quick` makes smaller, where it is not set by hand."""
 
@@ -40,13 +44,15 @@ COMMON = ("model", "epochs", "contact_model", "chunk_length", "seed")
 
 @dataclasses.dataclass(frozen=True)
 class Learn:
-    """Learn masses, potential, friction and restitution of a task from trajectories.
+    """Learn masses, potential, friction and restitution of a task, or of a system of your own, from trajectories.
 
     Writes a run folder: configuration, metrics, checkpoints, the learned model, a report, and pictures.
     """
 
-    task: TaskName
-    """Name of the task: its geometry is known, all else is learned."""
+    task: SystemName
+    """Name of the task, or a Python file that sets `system`: its geometry is known, all else is learned."""
+    from_run: Annotated[FolderPath, tyro.conf.arg(name="from")] = None
+    """Run folder to take all options from, the task too; those given here change them."""
     data: FilePath = None
     """Trajectory file (.h5, .hdf5, .npz or .csv) to learn from; without it, data are simulated."""
     val: FilePath = None
@@ -74,9 +80,39 @@ class Learn:
     config: LearnConfig = dataclasses.field(default_factory=LearnConfig)
     tosses: TossConfig = dataclasses.field(default_factory=TossConfig)
 
+    @classmethod
+    def defaults(cls, words: Sequence[str]) -> "Learn | None":
+        """The options of the run folder after `--from`, if the words of the command line have it.
+
+        **Raises:** `CaromError` if it is not a run folder, or of other options than this version has.
+        """
+        for k, word in enumerate(words):
+            if word == "--from" or word.startswith("--from="):
+                folder = word.removeprefix("--from").removeprefix("=") or "".join(words[k + 1 : k + 2])
+                require(bool(folder), "from must be a run folder; nothing came after it.")
+                return cls._of_run(RunFolder.open(folder))
+        return None
+
+    @classmethod
+    def _of_run(cls, run: RunFolder) -> "Learn":
+        kept = run.read_json(CONFIG)
+        try:
+            options = {f.name: kept[f.name] for f in dataclasses.fields(LearnConfig)}
+            config = LearnConfig(**{**options, "learn": tuple(options["learn"])})
+            tosses = TossConfig(**kept["tosses"]) if kept.get("tosses") else TossConfig()
+            files = {name: kept[name] and Path(kept[name]) for name in ("data", "val", "test")}
+            others = {name: kept[name] for name in ("trajectories", "data_contact_model", "data_noise")}
+        except (KeyError, TypeError) as error:
+            raise CaromError(
+                f"the run in {run.path} was not started by this version's `carom learn` ({error}): give its options "
+                "by hand."
+            ) from error
+        task = str(run.path / SYSTEM) if is_file(kept["task"]) else kept["task"]
+        return cls(task, run.path, **files, **others, config=config, tosses=tosses)
+
     def after_interrupt(self) -> str:
         """What to say when interrupted."""
-        return "The last checkpoint is kept: go on with --out FOLDER --resume." if self.out else ""
+        return "The last checkpoint is kept: go on with `carom learn --from RUN --out RUN --resume`."
 
     def run(self) -> None:
         """Do it."""
@@ -93,9 +129,14 @@ class Learn:
         )
 
     def _run(self, console: Console) -> None:
-        truth = task(self.task)
+        chosen = self._chosen()
+        truth = chosen.system
         self.config.check()
         self.config.prepare(truth)
+        require(
+            self.data is not None or not chosen.own,
+            f"data is needed for {chosen.name}: a trajectory file to learn from.",
+        )
         contact_model_of(self.data_contact_model, argument="data_contact_model")
         require(
             0 <= self.data_noise < np.inf,
@@ -110,21 +151,23 @@ class Learn:
             self._run_tosses(console, truth)
             return
         if not is_first():
-            learn(truth, self._data(truth, console)[0], self.config, progress=False)
+            learn(truth, self._data(chosen, console)[0], self.config, progress=False)
             return
-        folder = RunFolder.choose(self.out, f"{self.task}-{self.config.model}", resume=self.resume)
+        folder = RunFolder.choose(self.out, f"{chosen.stem}-{self.config.model}", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
-            dataset, test = self._data(truth, console)
-            run = RunFolder.create(folder, self._description())
+            dataset, test = self._data(chosen, console)
+            run = RunFolder.create(folder, self._description(chosen))
             save_recording(run.path / TEST_DATA, test)
-            run.write_json(TRUTH, quantities(truth))
+            run.write_json(TRUTH, None if chosen.truth is None else quantities(truth))
+            if chosen.source is not None:
+                write_whole(run.path / SYSTEM, chosen.source)
         else:
             run = RunFolder.open(folder)
-            run.check_same(self._description())
-            dataset, test = self._data(truth, console)
+            run.check_same(self._description(chosen))
+            dataset, test = self._data(chosen, console)
         console.print(
-            f"Learning {self.task} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
+            f"Learning {chosen.name} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
             f"{int(dataset.train.length.max())} states into {run.path}",
             soft_wrap=True,
             highlight=False,
@@ -133,7 +176,7 @@ class Learn:
             system, report = learn(truth, dataset, self.config, run=run)
         finally:
             run.close()
-        self._finish(console, run, system, report, truth, dataset, test)
+        self._finish(console, run, system, report, chosen, dataset, test)
 
     def _run_tosses(self, console: Console, skeleton: System) -> None:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
@@ -148,7 +191,7 @@ class Learn:
             data, val = parts.train, parts.val
         else:
             val = load_recording(self.val, task=self.task)
-        settings = {**self._description(), "tosses": dataclasses.asdict(self.tosses)}
+        settings = {**self._description(self._chosen()), "tosses": dataclasses.asdict(self.tosses)}
         if self.resume:
             run = RunFolder.open(folder)
             run.check_same(settings)
@@ -162,12 +205,22 @@ class Learn:
         )
         learn_and_measure(console, run, skeleton, data, val, self.tosses)
 
-    def _description(self) -> dict[str, Any]:
+    def _chosen(self) -> Chosen:
+        """The system to learn, under the name that it was first given."""
+        chosen = choose(self.task)
+        first = None if self.from_run is None else RunFolder.open(self.from_run)
+        if first is not None and self.task == str(first.path / SYSTEM):
+            return dataclasses.replace(chosen, name=first.read_json(CONFIG)["task"])
+        return chosen
+
+    def _description(self, chosen: Chosen) -> dict[str, Any]:
+        files = {name: getattr(self, name) for name in ("data", "val", "test")}
         return {
-            "task": self.task,
-            "data": str(self.data) if self.data else None,
-            "val": str(self.val) if self.val else None,
-            "test": str(self.test) if self.test else None,
+            "task": chosen.name,
+            "system_sha256": chosen.digest,
+            **{name: path and str(path.absolute()) for name, path in files.items()},
+            **{f"{name}_sha256": path and _digest(path) for name, path in files.items()},
+            "data_noise": self.data_noise,
             "trajectories": self.trajectories,
             "data_contact_model": self.data_contact_model,
             **dataclasses.asdict(self.config),
@@ -176,8 +229,9 @@ class Learn:
             "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         }
 
-    def _data(self, truth: System, console: Console) -> tuple[Dataset, Recording]:
+    def _data(self, chosen: Chosen, console: Console) -> tuple[Dataset, Recording]:
         """Training, validation and test data: read, or simulated from seeds of their own."""
+        truth = chosen.system
         if self.data is None:
             for name in ("val", "test"):
                 require(getattr(self, name) is None, f"{name} needs --data: give the file to train on too.")
@@ -194,19 +248,19 @@ class Learn:
                 rng = np.random.default_rng((self.config.seed, 17))
                 train, val = (noisy(self.task, part, self.data_noise, rng) for part in (train, val))
             return Dataset(train, val), test
-        data = load_recording(self.data, task=self.task)
-        test = load_recording(self.test, task=self.task) if self.test else None
+        data = load_recording(self.data, task=chosen.task)
+        test = load_recording(self.test, task=chosen.task) if self.test else None
         if test is None:
             data, test = _hold_out(data, self.config.seed)
         if self.val is not None:
-            return Dataset(data, load_recording(self.val, task=self.task)), test
+            return Dataset(data, load_recording(self.val, task=chosen.task)), test
         return Dataset.split(data, val=1 / 9, seed=self.config.seed), test
 
-    def _finish(self, console, run, system, report: LearnReport, truth, dataset, test) -> None:
+    def _finish(self, console, run, system, report: LearnReport, chosen: Chosen, dataset, test) -> None:
         formulation, compensation = FORMULATIONS[self.config.model], self.config.compensation_steps
         save_model(run.path / MODEL, system, formulation=formulation, compensation_steps=compensation)
         measures, predicted = evaluate(
-            system, test, truth=truth, formulation=formulation, compensation_steps=compensation
+            system, test, truth=chosen.truth, formulation=formulation, compensation_steps=compensation
         )
         found = what_is_told(system, dataset.train, dataclasses.asdict(self.config), console)
         run.write_json(
@@ -217,7 +271,7 @@ class Learn:
                 "identification": found and dataclasses.asdict(found),
             },
         )
-        console.print(property_table(system, truth))
+        console.print(property_table(system, chosen.system, chosen.name if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))
         console.print(evaluation_table(measures))
@@ -258,51 +312,6 @@ def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
     return data.select(np.sort(order[count:])), data.select(np.sort(order[:count]))
 
 
-def what_is_told(
-    system: System, recording: Recording, config: dict[str, Any], console: Console
-) -> Identification | None:
-    """What the recording tells of the properties of a system learned with `config`.
-
-    None for a baseline, which has no properties, and for a system that is too large.
-    """
-    if config["model"] in BASELINES:
-        return None
-    if system.n_points > MOST_POINTS:
-        console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
-        return None
-    console.print("Finding what the data can tell ...", highlight=False)
-    return identify(
-        system,
-        recording,
-        learned=config["learn"],
-        formulation=FORMULATIONS[config["model"]],
-        compensation_steps=config["compensation_steps"],
-        project=config["project"],
-    )
-
-
-def pictures(run: RunFolder, system: System, test: Recording, predicted: Trajectory) -> None:
-    """Draw learning curves, contact properties, error over time, and the animation of one test trajectory."""
-    from carom.view import animate, figures  # matplotlib is slow to import
-
-    metrics = run.metrics()
-    if metrics:
-        figures.learning_curves(metrics, run.path / "learning_curves.png")
-    if metrics and metrics[-1]["friction"]:
-        where, kept = run.path / "contact_properties.png", quantities(system)
-        figures.contact_properties(metrics, run.read_json(TRUTH), where, kept=kept)
-    relative, _ = state_errors(test, predicted)
-    figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")
-    k = most_eventful(test)
-    shown = trajectory_of(test, k)
-    animate.animate(system, shown, one_of(predicted, k, len(shown.time)), run.path / "prediction.gif")
-
-
-def one_of(batch: Trajectory, k: int, length: int) -> Trajectory:
-    """Trajectory number `k` of a batch, up to `length`."""
-    return jax.tree.map(lambda a: a[:length] if a is batch.time else a[k, :length], batch)
-
-
-def most_eventful(test: Recording) -> int:
-    """The test trajectory with the most contact, the first of equals."""
-    return 0 if test.contact is None else int(np.argmax(test.contact.sum(axis=1)))
+def _digest(path: Path) -> str | None:
+    """SHA-256 of a file; None of one that is not there, which is said where it is read."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None

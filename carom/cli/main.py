@@ -100,8 +100,10 @@ def _parsed(words: list[str]) -> Any:
     command = getattr(importlib.import_module(f"carom.cli.{module}"), kind)
     if not everything and {"-h", "--help"} & set(rest):
         _hide_rare_options(command)
+    defaults = command.defaults(rest[1:]) if hasattr(command, "defaults") else None
     return tyro.cli(
         command,
+        default=defaults,
         **{**options, "args": rest[1:], "prog": f"carom {name}", "description": inspect.cleandoc(command.__doc__)},
     )
 

@@ -15,7 +15,8 @@ from carom.checks import require
 class New:
     """Write a commented Python program: a system of your own, simulated, learned again, and looked at.
 
-    It runs as it is (`python FILE`, about a minute the first time): change it from there.
+    It runs as it is (`python FILE`, about a minute the first time): change it from there. `carom learn FILE --data
+    MOTIONS` learns its system from a file of yours.
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]

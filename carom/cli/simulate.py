@@ -9,8 +9,8 @@ from rich.console import Console
 
 from carom.atomic import check_writable
 from carom.checks import require
-from carom.cli.arguments import CompensationSteps, ContactModelName, FilePath, FolderPath, TaskName
-from carom.cli.runs import learned_system
+from carom.cli.arguments import CompensationSteps, ContactModelName, FilePath, FolderPath, SystemName
+from carom.cli.systems import choose, learned_system
 from carom.learning.dataset import recording_of
 from carom.learning.run import MODEL
 from carom.simulation.files import load_recording, save_recording
@@ -21,10 +21,10 @@ from carom.tasks import find_task, sample
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
-    """Simulate a task and write its trajectories to a file."""
+    """Simulate a task, or a system of your own, and write its trajectories to a file."""
 
-    task: TaskName
-    """Name of the task."""
+    task: SystemName
+    """Name of the task, or a Python file that sets `system`; such a one also needs --initial."""
     out: FilePath = None
     """File to write (.h5, .hdf5, .npz or .csv); by default TASK.h5."""
     run_folder: FolderPath = None
@@ -34,9 +34,9 @@ class Simulate:
     trajectories: int = 10
     """How many."""
     steps: int | None = None
-    """Time steps of each; by default the task's."""
+    """Time steps of each; by default the task's, or of a system of your own those of --initial."""
     dt: float | None = None
-    """Time step in seconds; by default the task's."""
+    """Time step in seconds; by default the task's, or of a system of your own that of --initial."""
     seed: int = 0
     """Seed of the initial states."""
     project: bool = True
@@ -54,8 +54,8 @@ class Simulate:
 
     def run(self) -> None:
         """Do it."""
-        chosen = find_task(self.task)
-        system, formulation, source = chosen.system(), "lagrangian", "carom simulate"
+        chosen = choose(self.task)
+        system, formulation, source = chosen.system, "lagrangian", "carom simulate"
         compensation = COMPENSATION_STEPS
         if self.run_folder is not None:
             system, header = learned_system(self.run_folder, self.task)
@@ -67,25 +67,34 @@ class Simulate:
                 f"{source}, contact model {self.contact_model}",
             )
         require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
-        out = Path(f"{self.task}.h5") if self.out is None else self.out
+        out = Path(f"{chosen.stem}.h5") if self.out is None else self.out
         check_writable(out)
-        if self.initial is not None:
-            first = load_recording(self.initial, task=self.task)
+        require(
+            self.initial is not None or not chosen.own,
+            f"initial is needed for {self.task}: a trajectory file, to start from its first states.",
+        )
+        first = None if self.initial is None else load_recording(self.initial, task=chosen.task)
+        if first is not None:
             x0, v0 = jnp.asarray(first.x[:, 0]), jnp.asarray(first.v[:, 0])
         else:
             x0, v0 = sample(system, jax.random.key(self.seed), self.trajectories)
+        if first is not None and chosen.own:
+            dt, steps = first.dt, int(first.length.max()) - 1
+        else:
+            known = find_task(self.task)
+            dt, steps = known.dt, known.steps
         trajectory = simulate(
             system,
             x0,
             v0,
-            dt=chosen.dt if self.dt is None else self.dt,
-            steps=chosen.steps if self.steps is None else self.steps,
+            dt=dt if self.dt is None else self.dt,
+            steps=steps if self.steps is None else self.steps,
             impact=self.impact,
             project=self.project,
             formulation=formulation,
             compensation_steps=compensation if self.compensation_steps == "auto" else self.compensation_steps,
         )
-        save_recording(out, recording_of(trajectory, task=self.task, source=source))
+        save_recording(out, recording_of(trajectory, task=chosen.task or "", source=source))
         n, states = trajectory.x.shape[:2]
         share = float(trajectory.contact.mean())
         text = f"Wrote {n} trajectories of {states} states to {out}; {share:.0%} of the states follow a contact."

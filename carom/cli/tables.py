@@ -23,12 +23,15 @@ def property_names(system: System) -> list[str]:
     ]
 
 
-def property_table(system: System, truth: System) -> Table:
-    """Learned and true friction, restitution and mass ratios, with errors; those that the system has."""
-    table = Table(title="Learned and true")
+def property_table(system: System, truth: System, file: str = "") -> Table:
+    """Learned and true friction, restitution and mass ratios, with errors; those that the system has.
+
+    `file`: where numbers to compare with are from that need not be true.
+    """
+    table = Table(title=f"Learned, and as {file} has them" if file else "Learned and true")
     for name in ("quantity", "of"):
         table.add_column(name)
-    for name in ("true", "learned", "error"):
+    for name in ("in the file", "learned", "difference") if file else ("true", "learned", "error"):
         table.add_column(name, justify="right")
     names = property_names(system)
     has = physical_quantities(system)

@@ -14,7 +14,8 @@ import tyro
 from rich.console import Console
 
 from carom.checks import require
-from carom.cli.learn import TEST_DATA, one_of
+from carom.cli.outcome import TEST_DATA, one_of
+from carom.cli.systems import choose, chosen_by
 from carom.learning.dataset import trajectory_of
 from carom.learning.evaluate import predict
 from carom.learning.model_file import load_model_into, read_model_header
@@ -23,7 +24,6 @@ from carom.simulation.files import Recording, load_recording
 from carom.simulation.impact import COMPENSATION_STEPS
 from carom.simulation.rollout import Trajectory
 from carom.system import System
-from carom.tasks import task
 
 HOST = "127.0.0.1"
 """Nobody else's computer can look."""
@@ -45,7 +45,7 @@ class View:
     trajectories: int = 4
     """How many trajectories to choose from, those with the most contact first (a .gif or .mp4 has one)."""
     task: str = ""
-    """Name of the task, for a trajectory file that does not say."""
+    """Name of the task, or a Python file with a `system`, for a trajectory file that does not say."""
     port: int = 0
     """Port to serve the page on; 0: any that is free."""
     no_open: bool = False
@@ -80,10 +80,10 @@ class View:
 
     def _run_folder(self) -> "_Shown":
         run = RunFolder.open(self.run_or_file)
-        name = run.read_json(CONFIG)["task"]
+        chosen, name = chosen_by(run), run.read_json(CONFIG)["task"]
         header = read_model_header(run.path / MODEL)
-        system = load_model_into(run.path / MODEL, task(name))
-        test = self._some(load_recording(run.path / TEST_DATA, task=name))
+        system = load_model_into(run.path / MODEL, chosen.system)
+        test = self._some(load_recording(run.path / TEST_DATA, task=chosen.task))
         compensation = header["compensation_steps"]
         found = predict(system, test, formulation=header["formulation"], compensation_steps=compensation)
         pairs = [
@@ -93,10 +93,14 @@ class View:
         return _Shown(system, pairs, f"{name}: true and predicted", compensation)
 
     def _file(self) -> "_Shown":
-        recording = load_recording(self.run_or_file, task=self.task or None)
+        chosen = choose(self.task) if self.task else None
+        recording = load_recording(self.run_or_file, task=chosen and chosen.task)
         name = self.task or recording.task
-        require(bool(name), f"{self.run_or_file} does not say of which task it is. Give its name with --task.")
-        system = task(name)
+        require(
+            bool(name),
+            f"{self.run_or_file} does not say of which task it is. Give its name, or a Python file, with --task.",
+        )
+        system = (chosen or choose(name)).system
         shape = (system.n_points, system.dim)
         require(
             recording.x.shape[2:] == shape,

@@ -15,17 +15,21 @@ from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
 
-CONFIG, TRUTH, METRICS, REPORT, MODEL = (
+CONFIG, TRUTH, METRICS, REPORT, MODEL, SYSTEM = (
     "config.json",
     "truth.json",
     "metrics.jsonl",
     "report.json",
     "model.carom",
+    "system.py",
 )
 
 
 class RunFolder:
-    """A folder with `config.json`, `metrics.jsonl`, `checkpoints/`, `model.carom`, `report.json` and figures."""
+    """A folder with `config.json`, `metrics.jsonl`, `checkpoints/`, `model.carom`, `report.json` and figures.
+
+    Of a system of the user's own it has the file too: `system.py`.
+    """
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)

@@ -1,0 +1,71 @@
+"""What comes out of a training: what the data tell, and pictures of it, for `learn` and `evaluate`."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from carom.learning.baselines import BASELINES
+from carom.learning.config import FORMULATIONS
+from carom.learning.dataset import trajectory_of
+from carom.learning.evaluate import state_errors
+from carom.learning.identify import MOST_POINTS, Identification, identify
+from carom.learning.run import TRUTH, RunFolder
+from carom.learning.train import quantities
+from carom.simulation.files import Recording
+from carom.simulation.rollout import Trajectory
+from carom.system import System
+
+TEST_DATA = "test.h5"
+"""The run folder's file of test data."""
+
+
+def what_is_told(
+    system: System, recording: Recording, config: dict[str, Any], console: Console
+) -> Identification | None:
+    """What the recording tells of the properties of a system learned with `config`.
+
+    None for a baseline, which has no properties, and for a system that is too large.
+    """
+    if config["model"] in BASELINES:
+        return None
+    if system.n_points > MOST_POINTS:
+        console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
+        return None
+    console.print("Finding what the data can tell ...", highlight=False)
+    return identify(
+        system,
+        recording,
+        learned=config["learn"],
+        formulation=FORMULATIONS[config["model"]],
+        compensation_steps=config["compensation_steps"],
+        project=config["project"],
+    )
+
+
+def pictures(run: RunFolder, system: System, test: Recording, predicted: Trajectory) -> None:
+    """Draw learning curves, contact properties, error over time, and the animation of one test trajectory."""
+    from carom.view import animate, figures  # matplotlib is slow to import
+
+    metrics = run.metrics()
+    if metrics:
+        figures.learning_curves(metrics, run.path / "learning_curves.png")
+    if metrics and metrics[-1]["friction"]:
+        where, kept = run.path / "contact_properties.png", quantities(system)
+        figures.contact_properties(metrics, run.read_json(TRUTH), where, kept=kept)
+    relative, _ = state_errors(test, predicted)
+    figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")
+    k = most_eventful(test)
+    shown = trajectory_of(test, k)
+    animate.animate(system, shown, one_of(predicted, k, len(shown.time)), run.path / "prediction.gif")
+
+
+def one_of(batch: Trajectory, k: int, length: int) -> Trajectory:
+    """Trajectory number `k` of a batch, up to `length`."""
+    return jax.tree.map(lambda a: a[:length] if a is batch.time else a[k, :length], batch)
+
+
+def most_eventful(test: Recording) -> int:
+    """The test trajectory with the most contact, the first of equals."""
+    return 0 if test.contact is None else int(np.argmax(test.contact.sum(axis=1)))

@@ -1,0 +1,112 @@
+"""Which system a command is about: a task's, by its name, or one of the user's own, from a Python file."""
+
+import dataclasses
+import hashlib
+import runpy
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+from carom.checks import require
+from carom.errors import CaromError
+from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.run import CONFIG, MODEL, SYSTEM, RunFolder
+from carom.system import System
+from carom.tasks import task
+
+VARIABLE = "system"
+"""What a Python file calls its system."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Chosen:
+    """A system that was asked for: `name`, as it was given; `source`, the bytes of its file if it is the user's own.
+
+    Of a user's own the masses, friction and restitution need not be true: they are what the file says.
+    """
+
+    name: str
+    system: System
+    source: bytes | None = None
+
+    @property
+    def own(self) -> bool:
+        """Whether it is from a file."""
+        return self.source is not None
+
+    @property
+    def stem(self) -> str:
+        """A name for folders and files."""
+        return Path(self.name).stem if self.own else self.name
+
+    @property
+    def truth(self) -> System | None:
+        """The true system, where it is known."""
+        return None if self.own else self.system
+
+    @property
+    def task(self) -> str | None:
+        """The task that a recording of it names; None where it need not name any."""
+        return None if self.own else self.name
+
+    @property
+    def digest(self) -> str | None:
+        """SHA-256 of its file."""
+        return None if self.source is None else hashlib.sha256(self.source).hexdigest()
+
+
+def is_file(name: str) -> bool:
+    """Whether a name means a Python file, not a task."""
+    return name.endswith(".py")
+
+
+def choose(name: str) -> Chosen:
+    """The system of the task of this name, or of the Python file, which is run.
+
+    **Raises:** `CaromError` for an unknown task, and for a file that is missing, fails, or makes no `System`.
+    """
+    if not is_file(name):
+        return Chosen(name, task(name))
+    path = Path(name)
+    require(path.is_file(), f"task is the file {name!r}, which does not exist. `carom new {path.name}` writes one.")
+    system = _run_file(path).get(VARIABLE)
+    if not isinstance(system, System):
+        found = "missing" if system is None else type(system).__name__
+        raise CaromError(f"{name} must set `{VARIABLE}` to a carom.System outside of any function; it was {found}.")
+    return Chosen(name, system, path.read_bytes())
+
+
+def chosen_by(run: RunFolder) -> Chosen:
+    """The system that a run learns: of its task, or of its own copy of the user's file."""
+    name = run.read_json(CONFIG)["task"]
+    return choose(str(run.path / SYSTEM)) if is_file(name) else choose(name)
+
+
+def learned_system(folder: Path, name: str) -> tuple[System, dict[str, Any]]:
+    """The system learned in a run folder, which must be of the task or file of this name, and the header of its file.
+
+    **Raises:** `CaromError` if it is not a run folder, has no model yet, or one of another system.
+    """
+    run = RunFolder.open(folder)
+    learned = run.read_json(CONFIG)["task"]
+    require(
+        learned == name or (is_file(learned) and is_file(name)),
+        f"the run folder {folder} holds a model of {learned!r}, not {name!r}.",
+    )
+    model = run.path / MODEL
+    return load_model_into(model, chosen_by(run).system), read_model_header(model)
+
+
+def _run_file(path: Path) -> dict[str, Any]:
+    """The names that a Python file defines; modules beside it can be imported, as when it is run itself."""
+    sys.path.insert(0, str(path.absolute().parent))
+    try:
+        return runpy.run_path(str(path))
+    except Exception as error:
+        places = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = error.lineno if isinstance(error, SyntaxError) else places[-1].lineno if places else None
+        first = (str(error).splitlines() or [""])[0]
+        raise CaromError(f"{path}{f', line {line}' if line else ''}: {type(error).__name__}: {first}") from error
+    finally:
+        sys.path.pop(0)
