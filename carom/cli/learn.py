@@ -151,12 +151,12 @@ class Learn:
             self._run_tosses(console, truth)
             return
         if not is_first():
-            learn(truth, self._data(chosen, console)[0], self.config, progress=False)
+            learn(truth, self.data_sets(chosen, console)[0], self.config, progress=False)
             return
         folder = RunFolder.choose(self.out, f"{chosen.stem}-{self.config.model}", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
-            dataset, test = self._data(chosen, console)
+            dataset, test = self.data_sets(chosen, console)
             run = RunFolder.create(folder, self._description(chosen))
             save_recording(run.path / TEST_DATA, test)
             run.write_json(TRUTH, None if chosen.truth is None else quantities(truth))
@@ -165,7 +165,7 @@ class Learn:
         else:
             run = RunFolder.open(folder)
             run.check_same(self._description(chosen))
-            dataset, test = self._data(chosen, console)
+            dataset, test = self.data_sets(chosen, console)
         console.print(
             f"Learning {chosen.name} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
             f"{int(dataset.train.length.max())} states into {run.path}",
@@ -229,7 +229,7 @@ class Learn:
             "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         }
 
-    def _data(self, chosen: Chosen, console: Console) -> tuple[Dataset, Recording]:
+    def data_sets(self, chosen: Chosen, console: Console) -> tuple[Dataset, Recording]:
         """Training, validation and test data: read, or simulated from seeds of their own."""
         truth = chosen.system
         if self.data is None:

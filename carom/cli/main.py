@@ -27,6 +27,7 @@ COMMANDS = {
     "view": ("view", "View", "Show a run or a trajectory file, moving, in the browser; or save it."),
     "control": ("control", "ControlCommand", "Find start or forces that bring a system where it should go."),
     "import": ("import_data", "Import", "Turn recorded poses of a tossed body into a trajectory file."),
+    "sweep": ("sweep", "Sweep", "Train with many different options, several at a time, and find the best."),
     "reproduce": ("reproduce", "Reproduce", "Learn and measure what a table of the paper has."),
     "new": ("new", "New", "Write a commented program to start a system of your own from."),
     "doctor": ("doctor", "Doctor", "Check versions, devices, the contact solver and gradients on this machine."),
