@@ -24,6 +24,8 @@ from .learning.evaluate import evaluate as evaluate
 from .learning.identify import Estimate as Estimate
 from .learning.identify import Identification as Identification
 from .learning.identify import identify as identify
+from .learning.inspection import Inspection as Inspection
+from .learning.inspection import inspect_recording as inspect_recording
 from .learning.model_file import save_model as save_model
 from .learning.models import NeuralPotential as NeuralPotential
 from .learning.refine import IdentifyConfig as IdentifyConfig

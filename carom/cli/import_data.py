@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 import equinox as eqx
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from carom.atomic import check_writable
 from carom.checks import require
@@ -76,6 +75,7 @@ class Import:
         )
 
     def _import(self) -> None:
+        from carom.cli.tables import findings_table
         from carom.simulation.files import save_recording
         from carom.simulation.pose_checks import check_poses, flight_noise
         from carom.simulation.poses import at_samples, load_poses, velocity_lag, with_velocities
@@ -102,11 +102,7 @@ class Import:
         about = f"{self.file.name}, width {width} m" + (f", mass {self.mass} kg" if self.mass else "")
         save_recording(out, poses.to_recording(task=self.task, source=about))
         console = Console()
-        table = Table(title=f"{self.file.name}: {len(poses.length)} trajectories at {1 / poses.dt:.0f} Hz")
-        for name in ("check", "found", "what to do"):
-            table.add_column(name)
-        for finding in findings:
-            table.add_row(*finding)
+        table = findings_table(f"{self.file.name}: {len(poses.length)} trajectories at {1 / poses.dt:.0f} Hz", findings)
         table.add_row("noise of heights in flight", f"{flight_noise(poses) * 1e3:.3f} mm", "")
         console.print(table)
         if copies:

@@ -26,6 +26,7 @@ COMMANDS = {
     "simulate": ("simulate", "Simulate", "Simulate a task and write its trajectories to a file."),
     "view": ("view", "View", "Show a run or a trajectory file, moving, in the browser; or save it."),
     "control": ("control", "ControlCommand", "Find start or forces that bring a system where it should go."),
+    "check": ("check", "Check", "Say what recorded data show of a system, and what they can tell, before learning."),
     "import": ("import_data", "Import", "Turn recorded poses of a tossed body into a trajectory file."),
     "sweep": ("sweep", "Sweep", "Train with many different options, several at a time, and find the best."),
     "reproduce": ("reproduce", "Reproduce", "Learn and measure what a table of the paper has."),

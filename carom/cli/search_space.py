@@ -29,9 +29,9 @@ class Range:
         """As optuna has it."""
         import optuna
 
-        whole = isinstance(self.low, int) and isinstance(self.high, int)
-        kind = optuna.distributions.IntDistribution if whole else optuna.distributions.FloatDistribution
-        return kind(self.low, self.high, log=self.log)
+        if isinstance(self.low, int) and isinstance(self.high, int):
+            return optuna.distributions.IntDistribution(self.low, self.high, log=self.log)
+        return optuna.distributions.FloatDistribution(self.low, self.high, log=self.log)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Tables on the terminal: learned against true, and how good the predictions are."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from carom.contact.impulses import CMr
 from carom.learning.baselines import physical_quantities
 from carom.learning.identify import Estimate, Identification
 from carom.learning.models import mass_ratios
+from carom.simulation.recording_checks import Finding
 from carom.system import System
 
 
@@ -78,6 +80,16 @@ def _told(estimate: Estimate) -> tuple[str, str, str]:
         return impacts, "", f"<= {estimate.bound:.3f}"
     interval = f"{max(estimate.value, 0.0):.4f} +- {1.96 * estimate.standard_error:.1g}"  # never -0.0000
     return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
+
+
+def findings_table(title: str, findings: Iterable[Finding]) -> Table:
+    """What checks of data found, and what to do about it."""
+    table = Table(title=title)
+    for name in ("check", "found", "what to do"):
+        table.add_column(name)
+    for finding in findings:
+        table.add_row(*finding)
+    return table
 
 
 MEASURES = {

@@ -2,23 +2,15 @@
 
 from collections.abc import Iterable
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from carom.simulation.corner_impacts import mass_balance
 from carom.simulation.poses import PoseRecording, flight_acceleration, free_flight, velocity_lag
+from carom.simulation.recording_checks import Finding
 
 STANDARD_GRAVITY = 9.81
-
-
-class Finding(NamedTuple):
-    """One check: what was found, and what to do about it ("" if nothing)."""
-
-    check: str
-    found: str
-    advice: str
 
 
 def check_poses(poses: PoseRecording, width: float) -> list[Finding]:

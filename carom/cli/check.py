@@ -1,0 +1,71 @@
+"""`carom check DATA`: what recorded data show of a system, and what they can tell, before anything is learned."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from carom.cli.systems import choose
+from carom.cli.tables import findings_table, told_table
+from carom.errors import CaromError
+from carom.learning.identify import MOST_POINTS, identify
+from carom.learning.inspection import inspect_recording
+from carom.simulation.files import Recording, load_recording
+from carom.simulation.recording_checks import check_recording
+from carom.system import System
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Say what recorded data show of a system, and what they can tell, before anything is learned.
+
+    Units, time step, velocities, noise, rods and joints, contacts, chunks to learn from; then the standard error that
+    friction, restitution and mass ratios would have. What looks wrong has an advice.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """Trajectory file (.h5, .hdf5, .npz or .csv)."""
+    task: str = ""
+    """Name of the task, or a Python file that sets `system`; by default the task that the file names."""
+    no_tell: bool = False
+    """Leave out what the data can tell, which takes most of the time."""
+
+    def run(self) -> None:
+        """Do it."""
+        console = Console()
+        chosen = choose(self.task) if self.task else None
+        recording = load_recording(self.data, task=chosen and chosen.task)
+        if chosen is None and recording.task:
+            chosen = choose(recording.task)
+        findings = (
+            check_recording(recording) if chosen is None else inspect_recording(recording, chosen.system).findings
+        )
+        seconds = recording.dt * (int(recording.length.max()) - 1)
+        title = (
+            f"{self.data.name}: {recording.n_trajectories} trajectories of up to {seconds:.3g} s, a sample every "
+            f"{recording.dt:.4g} s, {recording.n_points} points in {recording.dim}D"
+        )
+        console.print(findings_table(title, findings))
+        if chosen is None:
+            console.print("With --task NAME or --task FILE.py: what they show of that system.", highlight=False)
+        elif not self.no_tell:
+            self._tell(recording, chosen.system, console)
+        advised = sum(bool(finding.advice) for finding in findings)
+        console.print(f"{advised} of {len(findings)} checks have an advice." if advised else "Nothing looks wrong.")
+
+    def _tell(self, recording: Recording, system: System, console: Console) -> None:
+        """Standard errors of the estimator of `identify`, from the values that the system has."""
+        if not system.contacts or system.n_points > MOST_POINTS:
+            console.print(
+                f"What data can tell is found with contacts, and up to {MOST_POINTS} points.", highlight=False
+            )
+            return
+        console.print("Finding what the data can tell, with the potential as it is given ...", highlight=False)
+        try:
+            found = identify(system, recording, learned=("mass", "friction", "restitution"))
+        except CaromError as error:
+            console.print(f"It cannot be found: {error}", highlight=False)
+            return
+        console.print(told_table(system, found))

@@ -1,0 +1,136 @@
+"""What a recording shows of a system before anything is learned: does it fit, and what can it tell?"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from carom.checks import require
+from carom.contact.limits import BendLimit, StretchLimit
+from carom.learning.config import LearnConfig
+from carom.learning.dataset import Chunks, all_gaps, closing, contact_flags
+from carom.learning.refine import IdentifyConfig
+from carom.mechanics.constraints import Rigid
+from carom.mechanics.potentials import Gravity
+from carom.simulation.files import Recording
+from carom.simulation.recording_checks import Finding, check_recording
+from carom.system import System
+
+LOOSE = 1e-3
+"""Constraints that are off by more (m^2) deserve a look; `learn` refuses what is off by `LARGEST`."""
+LARGEST = 5e-2
+
+
+class Inspection(NamedTuple):
+    """Findings, and in how many recorded steps a contact of each property (P,) closes."""
+
+    findings: list[Finding]
+    closings: list[int]
+
+
+def inspect_recording(recording: Recording, system: System, config: LearnConfig | None = None) -> Inspection:
+    """What a recording shows, alone and of the geometry of `system`; nothing is learned.
+
+    **Arguments:** `recording`, the data; `system`, whose radii, walls, rods and joints are taken as right, and of whose
+    potential a uniform field alone is looked at; `config`, how it is to be learned.
+
+    **Raises:** `CaromError` if the recording is of another number of points or dimension.
+    """
+    shape = (system.n_points, system.dim)
+    require(
+        recording.x.shape[2:] == shape,
+        f"the recording has {recording.n_points} points in {recording.dim}D, the system {shape[0]} in {shape[1]}D. "
+        "Give a recording of this system: point masses have one point, rigid bodies d + 1.",
+    )
+    config = LearnConfig() if config is None else config
+    out = check_recording(recording)
+    if system.links:
+        out.append(_constraints(recording, system))
+    closings = closing(recording, system)
+    if system.contacts:
+        out.append(_depth(recording, system))
+    out += [found for check in (_step_length, _free_fall) if (found := check(recording, system)) is not None]
+    out.append(_chunks(recording, system, config))
+    for k in np.flatnonzero(closings < IdentifyConfig().min_impacts):
+        advice = f"too few to tell its friction and restitution: {IdentifyConfig().min_impacts} or more are needed"
+        out.append(Finding(f"impacts of property {k}", str(closings[k]), advice))
+    return Inspection(out, closings.tolist())
+
+
+def _constraints(recording: Recording, system: System) -> Finding:
+    off = np.abs(np.asarray(system.constraints(jnp.asarray(recording.x[recording.valid]))))
+    worst = float(off.max(initial=0.0))
+    advice = "" if worst <= LOOSE else "lengths of rods, units or the order of points may be wrong"
+    advice += "; `learn` refuses it" if worst > LARGEST else ""
+    return Finding("rods and joints are off by", f"{worst:.1e} m^2, median {np.median(off):.0e}", advice)
+
+
+def _depth(recording: Recording, system: System) -> Finding:
+    """The deepest contact, as a share of the depth at which bodies would be through each other."""
+    reach, deepest, place, states = np.asarray(system.reach()), 0.0, "", 0
+    count = 0
+    for k, (gaps, length) in enumerate(zip(all_gaps(recording.x, system), recording.length, strict=True)):
+        share = -gaps[:length] / reach
+        states += int((share > 0).any(axis=1).sum())
+        count += int(length)
+        if share.max(initial=0.0) > deepest:
+            deepest = float(share.max())
+            place = f" (trajectory {k}, sample {int(share.max(axis=1).argmax())})"
+    advice = f"bodies are through walls or each other{place}: check radii, walls and units" if deepest > 1 else ""
+    return Finding("states in contact", f"{states / count:.0%}, the deepest {deepest:.0%} of what can be", advice)
+
+
+def _step_length(recording: Recording, system: System) -> Finding | None:
+    """The longest way of a step, as a share of the smallest depth that a contact can have; limits of chains aside."""
+    touching = [contact for contact in system.contacts if not isinstance(contact, BendLimit | StretchLimit)]
+    reach = np.concatenate([np.zeros(0), *(np.asarray(contact.reach(system.radii)) for contact in touching)])
+    if not len(reach):
+        return None
+    longest = float(np.linalg.norm(recording.v, axis=-1)[recording.valid].max()) * recording.dt
+    share = longest / float(reach.min())
+    rate = np.ceil(1.5 * share) / recording.dt
+    advice = f"contacts may pass between samples: record at {rate:.0f} Hz or more" if share > 1 else ""
+    return Finding("longest way of a step", f"{longest:.2g} m, {share:.0%} of the smallest contact depth", advice)
+
+
+def _free_fall(recording: Recording, system: System) -> Finding | None:
+    """Acceleration of bodies that touch nothing, against the system's uniform field; None where that says nothing."""
+    free_bodies = all(isinstance(link, Rigid) for link in system.links)
+    if not (free_bodies and isinstance(system.potential, Gravity)):
+        return None
+    field = np.asarray(system.potential.acceleration)
+    size = float(np.linalg.norm(field))
+    flight = _untouched(recording, system)
+    if size == 0 or not flight.any():
+        return None
+    centers = recording.x[:, :, list(system.table.center)]
+    bend = (centers[:, 2:] - 2 * centers[:, 1:-1] + centers[:, :-2]) / recording.dt**2
+    fall = float(np.median((bend[flight] @ field) / size))
+    share = fall / size
+    advice = ""
+    if abs(share - 1) > 0.05:
+        advice = f"{share:.3g} times what the system says: are lengths in m and times in s, and does it point down?"
+    return Finding("acceleration in free flight", f"{fall:.4g} m/s^2, the system says {size:.4g}", advice)
+
+
+def _untouched(recording: Recording, system: System) -> Bool[np.ndarray, "N inner"]:
+    """Samples (but the first and last) without a closed contact next to them."""
+    closed = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
+    near = closed[:, 2:] | closed[:, 1:-1] | closed[:, :-2]
+    return recording.valid[:, 2:] & ~near
+
+
+def _chunks(recording: Recording, system: System, config: LearnConfig) -> Finding:
+    """Pieces of trajectories to learn from: those without and with a contact."""
+    flags = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
+    smooth, hit = Chunks.of(flags, recording.length, config.states).count()
+    advice = "" if hit or not system.contacts else "no contact to learn from"
+    if smooth + hit == 0:
+        longest = int(recording.length.max())
+        advice = (
+            f"trajectories are shorter ({longest} states): give --chunk-length {longest}"
+            if longest < config.states
+            else "none starts without contact"
+        )
+    return Finding(f"chunks of {config.states} states", f"{smooth} without, {hit} with a contact", advice)
