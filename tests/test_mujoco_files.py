@@ -19,6 +19,12 @@ SAME_ORDER = 1e-7
 """Both integrate to fourth order, by other formulas in other coordinates: 2e-9 apart after 100 steps of 2 ms."""
 
 
+@pytest.fixture(autouse=True)
+def _where_logs_may_be_left(tmp_path, monkeypatch):
+    """MuJoCo writes what it warns of into MUJOCO_LOG.TXT, where it is."""
+    monkeypatch.chdir(tmp_path)
+
+
 def world(content: str, *, more: str = "", option: str = "", contact: bool = False) -> str:
     """A model with `content` in its world; contact off unless it is what the test is about."""
     flag = "" if contact else '<flag contact="disable" energy="enable"/>'
@@ -136,7 +142,10 @@ def test_joints_leave_the_freedom_of_mujoco(joints):
     jacobian = np.asarray(jax.jacrev(system.constraints)(x)).reshape(len(value), -1)
     assert np.linalg.svd(jacobian)[1].min() > 1e-2
     assert x.size - len(value) == plain.nv
-    mujoco.mj_forward(plain, data)
+    mujoco.mj_kinematics(plain, data)
+    mujoco.mj_comPos(plain, data)
+    mujoco.mj_comVel(plain, data)
+    mujoco.mj_makeM(plain, data)
     mujoco.mj_energyPos(plain, data)
     mujoco.mj_energyVel(plain, data)
     energies = float(system.potential_energy(x)), float(system.kinetic_energy(v))
@@ -251,7 +260,9 @@ def test_which_geoms_touch_with_what_friction_is_as_in_mujoco(seed):
     loaded = carom.load_mujoco(xml)
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
     expected = {}
     for contact in data.contact:
         names = frozenset(model.geom(int(g)).name for g in contact.geom)
@@ -279,7 +290,7 @@ def test_capsules_and_boxes_are_balls_and_corners():
     assert loaded.system.n_candidates == 8 + 8 + 2 + 8
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    mujoco.mj_kinematics(model, data)
     normal, gaps = data.geom_xmat[0].reshape(3, 3)[:, 2], []
     for geom in range(1, model.ngeom):
         turn, size = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]

@@ -65,6 +65,16 @@ def name_of(model: Any, kind: str, index: int) -> str:
     return f"number {index}{where}"
 
 
+def placed(mujoco: Any, model: Any, qpos, qvel=0.0) -> Any:
+    """MuJoCo's `MjData` with the places and velocities of all bodies; no more, as the rest may be singular."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_comVel(model, data)
+    return data
+
+
 def groups_of(model: Any, data: Any) -> dict[int, Group]:
     """The rigid bodies by their MuJoCo body, that is the root of what is welded together; 0 is the world.
 
@@ -137,9 +147,7 @@ def state_of(
     mujoco: Any, model: Any, reference: Any, groups: dict[int, Group], qpos, qvel
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Positions and velocities of carom's points where MuJoCo has `qpos` and `qvel`."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    mujoco.mj_forward(model, data)
+    data = placed(mujoco, model, qpos, qvel)
     x, v, rates = [], [], np.zeros(6)
     for group in groups.values():
         if group.number is None:
@@ -284,13 +292,10 @@ def connects_of(
 
     **Raises:** `CaromError` where the ends are apart, nothing is left, or the start is a position of its own kind.
     """
-    start, near = mujoco.MjData(model), mujoco.MjData(model)
-    start.qpos[:] = near.qpos[:] = qpos
-    step = np.random.default_rng(0).uniform(0.01, 0.02, model.nv)
-    mujoco.mj_integratePos(model, near.qpos, step, 1.0)
+    moved = np.array(qpos)
+    mujoco.mj_integratePos(model, moved, np.random.default_rng(0).uniform(0.01, 0.02, model.nv), 1.0)
+    start, near = placed(mujoco, model, qpos), placed(mujoco, model, moved)
     rows, rows_near, found = np.zeros((0, model.nv)), np.zeros((0, model.nv)), []
-    for data in (start, near):
-        mujoco.mj_forward(model, data)
     for loop in loops:
         welds = [groups[int(model.body_weldid[b])] for b in loop.bodies]
         places = [

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from carom.checks import as_floats, require
 from carom.errors import CaromError
 from carom.mechanics.potentials import Gravity
-from carom.simulation.mujoco_bodies import bodies_of, connects_of, groups_of, joints_of, loops_of, state_of
+from carom.simulation.mujoco_bodies import bodies_of, connects_of, groups_of, joints_of, loops_of, placed, state_of
 from carom.simulation.mujoco_checks import check_ignore, refusals, refuse
 from carom.simulation.mujoco_contacts import contact_refusals, contacts_of, touching_pairs
 from carom.system import System
@@ -59,8 +59,7 @@ def load_mujoco(
     check_ignore(ignore)
     mujoco = _package()
     model = _read(mujoco, source)
-    reference = mujoco.MjData(model)
-    mujoco.mj_forward(model, reference)
+    reference = placed(mujoco, model, model.qpos0)
     touching = touching_pairs(mujoco, model)
     refuse([*refusals(mujoco, model), *contact_refusals(model, touching)], ignore)
     require(model.nv > 0, "the model has no joints: nothing in it moves. Give a body a freejoint, for one.")
