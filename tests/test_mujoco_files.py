@@ -1,6 +1,8 @@
 """Systems from MJCF and URDF: they move as MuJoCo's own do, and what cannot be represented is refused by name."""
 
+import re
 import sys
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -483,3 +485,17 @@ def test_without_mujoco_the_error_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with refused("load_mujoco needs the package mujoco, which is not installed: pip install 'carom[mujoco]'."):
         carom.load_mujoco("model.xml")
+
+
+@pytest.mark.slow
+def test_the_example_of_the_documentation_works(capsys):
+    page = (Path(__file__).parents[1] / "docs" / "mujoco.md").read_text()
+    names: dict = {}
+    exec(compile(re.findall(r"```python\n(.*?)```", page, re.S)[0], "mujoco.md", "exec"), names)
+    printed = capsys.readouterr().out
+    assert 'ignore=("damping",)' in printed
+    assert "('upper', 'lower', 'crate')" in printed
+    assert names["model"].properties == ("sphere 'hand' and plane 'floor'", "box 'crate' and plane 'floor'")
+    np.testing.assert_allclose(names["model"].system.friction, [0.6, 1.0])
+    assert names["motion"].contact.any()
+    assert 0.09 < names["crate"][-1, 2] < 0.12  # it has landed
