@@ -1,5 +1,7 @@
 """carom learns mechanical systems with contact from trajectories and hands back a differentiable simulator."""
 
+from .contact.balls import BallBall as BallBall
+from .contact.balls import BallPlane as BallPlane
 from .contact.boxes import CornerPlane as CornerPlane
 from .contact.candidates import Contact as Contact
 from .contact.candidates import DiskDisk as DiskDisk
@@ -37,10 +39,14 @@ from .learning.train import learn as learn
 from .mechanics.bodies import Body as Body
 from .mechanics.bodies import PointMass as PointMass
 from .mechanics.bodies import RigidBody as RigidBody
+from .mechanics.constraints import Angles as Angles
 from .mechanics.constraints import Constraint as Constraint
 from .mechanics.constraints import Distance as Distance
 from .mechanics.constraints import Joint as Joint
+from .mechanics.constraints import Pivot as Pivot
 from .mechanics.constraints import Tether as Tether
+from .mechanics.constraints import Track as Track
+from .mechanics.constraints import place_weights as place_weights
 from .mechanics.potentials import Gravity as Gravity
 from .mechanics.potentials import NoPotential as NoPotential
 from .mechanics.potentials import Potential as Potential
@@ -50,6 +56,8 @@ from .simulation.files import Recording as Recording
 from .simulation.files import load_recording as load_recording
 from .simulation.files import save_recording as save_recording
 from .simulation.integrators import RK4 as RK4
+from .simulation.mujoco_files import MujocoModel as MujocoModel
+from .simulation.mujoco_files import load_mujoco as load_mujoco
 from .simulation.poses import PoseRecording as PoseRecording
 from .simulation.poses import load_poses as load_poses
 from .simulation.rollout import Trajectory as Trajectory

@@ -40,8 +40,10 @@ class System(eqx.Module):
     **Arguments:**
 
     - `bodies`: `PointMass` and `RigidBody` objects; their points are stacked in this order into `x` (n, d).
-    - `constraints`: `Distance`, `Tether`, `Joint` objects between points; a rigid body's own are added.
-    - `contacts`: `DiskDisk`, `DiskPlane`, `RimPlane`, `BendLimit`, `StretchLimit` objects.
+    - `constraints`: `Distance`, `Tether`, `Joint`, `Pivot`, `Angles`, `Track` objects between points; a rigid body's
+      own are added.
+    - `contacts`: `DiskDisk`, `DiskPlane`, `RimPlane`, `CornerPlane`, `BallPlane`, `BallBall`, `BendLimit`,
+      `StretchLimit` objects.
     - `potential`: a `Potential`, such as `Gravity((0., -9.81))`; none by default.
     - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers
       to them by its `property` index; a single number is shared by all.

@@ -27,8 +27,10 @@ def rng():
         (carom.Tether(1, (1.0, 1.0), 3.0), [9 + 16 - 9]),
         (carom.Joint(0, (0.25, 0.75), (3.0, 3.0)), [0.25, 1]),
         (carom.Joint(1, (1.0,), (4.0, 5.0)), [0, 0]),
+        (carom.Pivot(0, (1.0,), 1, (1.0,)), [-3, -4]),
+        (carom.Track(1, (1.0,), [(0.6, 0.8)], (1.0, 0.0)), [0.6 * 3 + 0.8 * 5]),
     ],
-    ids=["distance", "distance that holds", "tether", "joint", "joint of a point"],
+    ids=["distance", "distance that holds", "tether", "joint", "joint of a point", "pivot", "track"],
 )
 def test_values_by_hand(constraint, expected):
     x = jnp.array([[1.0, 1.0], [4.0, 5.0]])
@@ -66,6 +68,28 @@ def test_a_joint_holds_a_material_point(rng):
     assert np.linalg.matrix_rank(jax.jacrev(system.constraints)(x[0]).reshape(9, 12)) == 9
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_joints_between_bodies_in_their_frames(rng, dim):
+    """`Pivot`, `Angles` and `Track` say of two bodies what they say of one body and space, seen from the second."""
+    rotation, _, x, _ = random_motions(rng, 2, dim)
+    points = x.reshape(-1, dim)
+    second = dim + 1
+    place, anchor, direction, other, normal = (jnp.asarray(rng.normal(size=dim)) for _ in range(5))
+    weights = carom.place_weights(place)
+    there = x[0, 0] + rotation[0] @ place
+    held = x[1, 0] + rotation[1] @ anchor
+    pivot = carom.Pivot(0, weights, second, carom.place_weights(anchor))
+    np.testing.assert_allclose(pivot(points), there - held, atol=ROUNDING)
+    turned = rotation[1] @ other
+    for others, j in ((other, second), (turned, None)):
+        angles = carom.Angles(0, direction[None], others[None], 0.5, j)
+        np.testing.assert_allclose(angles(points), [(rotation[0] @ direction) @ turned - 0.5], atol=ROUNDING)
+    for normals, point, j in ((normal, anchor, second), (rotation[1] @ normal, held, None)):
+        track = carom.Track(0, weights, normals[None], point, j)
+        np.testing.assert_allclose(track(points), [(rotation[1] @ normal) @ (there - held)], atol=ROUNDING)
+    assert pivot.points() == tuple(range(2 * second))
+
+
 def test_a_system_lists_links_first_and_rigid_bodies_last():
     body = carom.RigidBody(1.0, (0.1, 0.1))
     links = [carom.Distance(0, 4, 1.0), carom.Tether(1, ORIGIN, 1.0)]
@@ -80,6 +104,14 @@ BAD_CONSTRAINTS = {
     "negative length": (lambda: carom.Distance(0, 1, -1.0), "length must be a positive number"),
     "no length": (lambda: carom.Tether(0, ORIGIN, 0.0), "length must be a positive number"),
     "NaN length": (lambda: carom.Tether(0, ORIGIN, np.nan), "length must be a positive number"),
+    "pivot of one": (lambda: carom.Pivot(0, (1.0,), 0, (1.0,)), "Pivot joins two different bodies"),
+    "pivot weights": (lambda: carom.Pivot(0, (1.0,), 1, (0.5,)), "weights_j must be numbers that sum to 1"),
+    "angles of one": (lambda: carom.Angles(0, [ORIGIN], [ORIGIN], 0.0, 0), "Angles are between two different bodies"),
+    "angles shape": (lambda: carom.Angles(0, [ORIGIN], ORIGIN), "Angles directions and others must be as many vectors"),
+    "angles count": (lambda: carom.Angles(0, [ORIGIN], [ORIGIN], (0.0, 0.0)), "Angles cosines must be one number or 1"),
+    "no angle": (lambda: carom.Angles(0, [ORIGIN], [ORIGIN], 1.0), "cosines must be between -1 and 1"),
+    "track of one": (lambda: carom.Track(0, (1.0,), [ORIGIN], ORIGIN, 0), "Track joins two different bodies"),
+    "track shape": (lambda: carom.Track(0, (1.0,), ORIGIN, ORIGIN), "Track normals must be vectors (e, d) and anchor"),
     "weights": (lambda: carom.Joint(0, (0.5, 0.1, 0.1), ORIGIN), "weights must be numbers that sum to 1"),
 }
 

@@ -11,12 +11,14 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgb, to_rgba
 from matplotlib.patches import Polygon
 
+from carom.contact.balls import BallBall, BallPlane
 from carom.contact.boxes import CornerPlane
 from carom.contact.candidates import DiskDisk, DiskPlane, RimPlane
 from carom.mechanics.bodies import RigidBody
-from carom.mechanics.constraints import Distance, Joint, Tether
+from carom.mechanics.constraints import Distance, Joint, Pivot, Tether, Track
 from carom.simulation.rollout import Trajectory
 from carom.system import System
+from carom.view.balls import ball_lines, ball_reach, ball_touches
 from carom.view.style import BLUE, HATCH, INK, MUTED, ORANGE, PAPER, SOLID, TINT, TINT_EDGE, VERMILLION
 
 FAR = 1e6
@@ -66,6 +68,9 @@ def lines_of(system: System) -> Lines:
             weights.append([unit[link.i if isinstance(link, Tether) else link.first], 0 * unit[0]])
             anchors.append(np.asarray(link.anchor, float))
             offset.append([zero, anchors[-1]])
+        elif isinstance(link, Pivot | Track):
+            weights += _arms(link, unit)
+            offset += [[zero, zero]] * (len(weights) - len(offset))
     boxes = _boxes(system)
     for index, (half, middle) in boxes.items():
         center, axes = system.table.center[index], list(system.table.axes[index])
@@ -91,11 +96,22 @@ def lines_of(system: System) -> Lines:
                 rim = (1 - reach) * unit[center] + reach * unit[center + 1 + axis]
                 weights.append([unit[center], rim])
                 offset.append([zero, zero])
+    rings = ball_lines(system)
+    weights, offset = weights + rings[0], offset + rings[1]
     return Lines(
         np.reshape(weights, (-1, 2, n)),
         np.reshape(offset, (-1, 2, dim)),
         np.reshape(anchors, (-1, dim)),
     )
+
+
+def _arms(link: Pivot | Track, unit: np.ndarray) -> list[list[np.ndarray]]:
+    """From the centers of the bodies to the point that a joint holds."""
+    if isinstance(link, Pivot):
+        ends = [(link.i, link.weights_i), (link.j, link.weights_j)]
+    else:
+        ends = [(link.i, link.weights)]
+    return [[unit[i], np.asarray(w, float) @ unit[i : i + len(w)]] for i, w in ends]
 
 
 def _boxes(system: System) -> dict[int, tuple[np.ndarray, np.ndarray]]:
@@ -125,8 +141,8 @@ def _edges(dim: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def touching(system: System, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Where bodies can touch (time, C, d), and whether they did (time, C)."""
-    x = positions_of(trajectory, FAR)[:, list(system.table.center)]
-    radii = np.asarray(system.radii, float)
+    points = positions_of(trajectory, FAR)
+    x, radii = points[:, list(system.table.center)], np.asarray(system.radii, float)
     places, gaps = [np.zeros((len(x), 0, system.dim))], [np.zeros((len(x), 0))]
     for contact in system.contacts:
         if isinstance(contact, DiskPlane):
@@ -140,6 +156,10 @@ def touching(system: System, trajectory: Trajectory) -> tuple[np.ndarray, np.nda
             gaps.append(distance - radii[a] - radii[b])
             toward = between / np.maximum(distance, 1e-12)[..., None]
             places.append(x[:, a] + radii[a, None] * toward)
+        elif isinstance(contact, BallPlane | BallBall) and contact.property_index:
+            found = ball_touches(system, contact, points)
+            places.append(found[0])
+            gaps.append(found[1])
     # Recordings in single precision may be that far from closed.
     closed = np.concatenate(gaps, axis=1) < 1e-6
     return np.concatenate(places, axis=1), closed & np.asarray(trajectory.contact)[:, None]
@@ -157,7 +177,7 @@ def walls_of(system: System) -> list[Wall]:
     """Each plane once."""
     found: dict[tuple, Wall] = {}
     for contact in system.contacts:
-        if isinstance(contact, DiskPlane | CornerPlane | RimPlane):
+        if isinstance(contact, DiskPlane | CornerPlane | RimPlane | BallPlane):
             wall = Wall(np.asarray(contact.point, float), np.asarray(contact.normal, float))
             key = (*wall.normal.round(9), round(float(wall.point @ wall.normal), 9))
             found.setdefault(key, wall)
@@ -171,14 +191,17 @@ def box_of(system: System, trajectory: Trajectory, anchors: np.ndarray) -> np.nd
 
 
 def outlined_bodies(system: System) -> set[int]:
-    """The bodies whose lines are all there is to see: boxes and wheels."""
-    return {*_boxes(system), *_wheels(system)}
+    """The bodies whose lines are all there is to see: boxes, wheels, and those with balls beside their center."""
+    beside = {body for body in ball_reach(system) if float(system.bodies[body].radius) == 0}
+    return {*_boxes(system), *_wheels(system), *beside}
 
 
 def box_of_points(system: System, centers: np.ndarray, anchors: np.ndarray | None = None) -> np.ndarray:
     """Lower and upper corner (2, d) of all bodies whose centers (B T, d) go through these places, body by body."""
     anchors = lines_of(system).anchors if anchors is None else anchors
     radii = np.array(system.radii, float)[:, None]
+    for body, reach in ball_reach(system).items():
+        radii[body] = max(float(radii[body, 0]), reach)
     for body, (half, middle) in _boxes(system).items():
         radii[body] = np.linalg.norm(half + np.abs(middle))
     x = centers.reshape(-1, len(radii), system.dim)

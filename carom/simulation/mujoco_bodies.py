@@ -1,0 +1,349 @@
+"""Bodies and joints of a MuJoCo model: rigid bodies in their principal axes, and what holds them together.
+
+`model` and `data` are MuJoCo's own `MjModel` and `MjData`; `data` is at the model's reference position (`qpos0`), where
+the joints' anchors meet.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from carom.checks import require
+from carom.mechanics.bodies import RigidBody, embed_pose, embed_velocity
+from carom.mechanics.constraints import Angles, Constraint, Joint, Pivot, Track, place_weights
+
+FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
+SPHERE, BOX = 2, 6  # mjtGeom
+POINTS = 4
+"""Points of a rigid body in 3D."""
+NEAR = 1e-9
+"""Lengths (m) and sines that are nothing but rounding."""
+THINNEST = 1e-8
+"""The least ratio of second moments that double precision can tell from zero."""
+
+
+class Group(NamedTuple):
+    """A MuJoCo body with all that is welded to it, at the reference position: one rigid body.
+
+    `number` among carom's bodies, or `None` for the world; `place` of the centre of mass (m); `axes`, columns are the
+    principal axes; `moments` about their planes (kg m^2).
+    """
+
+    number: int | None
+    root: int
+    name: str
+    mass: float
+    place: Float[np.ndarray, " 3"]
+    axes: Float[np.ndarray, "3 3"]
+    moments: Float[np.ndarray, " 3"]
+
+    @property
+    def first(self) -> int | None:
+        """The index of its first point."""
+        return None if self.number is None else POINTS * self.number
+
+    def local(self, point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+        """Coordinates of a point of space in the frame of the body (m)."""
+        return self.axes.T @ (point - self.place)
+
+    def directions(self, rows: Float[np.ndarray, "e 3"]) -> Float[np.ndarray, "e 3"]:
+        """The same for directions."""
+        return np.asarray(rows) @ self.axes
+
+
+def name_of(model: Any, kind: str, index: int) -> str:
+    """The name of a `body`, `geom`, `joint` and so on in quotes, or where to find one that has none."""
+    name = getattr(model, kind)(index).name
+    if name:
+        return f"'{name}'"
+    if kind == "body":
+        return f"number {index}"
+    owner = {"geom": "geom_bodyid", "joint": "jnt_bodyid"}.get(kind)
+    where = "" if owner is None else f" of body {name_of(model, 'body', int(getattr(model, owner)[index]))}"
+    return f"number {index}{where}"
+
+
+def placed(mujoco: Any, model: Any, qpos, qvel=0.0) -> Any:
+    """MuJoCo's `MjData` with the places and velocities of all bodies; no more, as the rest may be singular."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_comVel(model, data)
+    return data
+
+
+def groups_of(model: Any, data: Any) -> dict[int, Group]:
+    """The rigid bodies by their MuJoCo body, that is the root of what is welded together; 0 is the world.
+
+    **Raises:** `CaromError` for bodies without extent in all three directions.
+    """
+    world = Group(None, 0, "world", 0.0, np.zeros(3), np.eye(3), np.zeros(3))
+    groups = {0: world}
+    for body in range(1, model.nbody):
+        root = int(model.body_weldid[body])
+        if root == body:
+            groups[body] = _group(model, data, body, len(groups) - 1)
+    return groups
+
+
+def _group(model: Any, data: Any, root: int, number: int) -> Group:
+    parts = np.flatnonzero(model.body_weldid == root)
+    masses = np.array(model.body_mass[parts])
+    name = name_of(model, "body", root).strip("'")
+    require(masses.sum() > 0, f"body '{name}' has no mass: give it an <inertial> or a geom with a mass.")
+    place = masses @ data.xipos[parts] / masses.sum()
+    inertia = np.zeros((3, 3))
+    for part, mass in zip(parts, masses, strict=True):
+        turn, arm = data.ximat[part].reshape(3, 3), data.xipos[part] - place
+        inertia += turn @ np.diag(model.body_inertia[part]) @ turn.T
+        inertia += mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    axes = _principal_axes(model, data, parts, inertia)
+    principal = np.diag(axes.T @ inertia @ axes)
+    moments = principal.sum() / 2 - principal  # I_x = mu_y + mu_z and so on
+    shown = ", ".join(f"{value:.3g}" for value in principal)
+    require(
+        bool(moments.min() > THINNEST * moments.max()),
+        f"body '{name}' has the principal moments of inertia ({shown}) kg m^2, of which one is not smaller than the "
+        "sum of the two others: its mass is all on a line or a plane. carom's bodies extend in all three directions: "
+        "give its geoms some thickness, or raise the smaller two values of its <inertial> a little (1e-4 of the "
+        "largest).",
+    )
+    return Group(number, root, name, float(masses.sum()), place, axes, moments)
+
+
+def _principal_axes(model: Any, data: Any, parts, inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Principal axes: those of a box or of the body's own frame, if they are principal, else of the inertia alone."""
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, parts))
+    boxes = [geom for geom in geoms if model.geom_type[geom] == BOX]
+    frames = [data.geom_xmat[geom] for geom in boxes] + [data.xmat[parts[0]], data.ximat[parts[0]]]
+    for frame in frames:
+        turn = frame.reshape(3, 3)
+        turned = turn.T @ inertia @ turn
+        if np.abs(turned - np.diag(np.diag(turned))).max() < NEAR * np.trace(inertia):
+            return turn.copy()
+    axes = np.linalg.eigh(inertia)[1]
+    return axes * np.array([1, 1, np.linalg.det(axes)])
+
+
+def bodies_of(model: Any, data: Any, groups: dict[int, Group]) -> list[RigidBody]:
+    """carom's bodies, with the radius of a sphere at their centre of mass, if there is one."""
+    return [
+        RigidBody(group.mass, jnp.asarray(group.moments), _radius(model, data, group))
+        for group in groups.values()
+        if group.number is not None
+    ]
+
+
+def _radius(model: Any, data: Any, group: Group) -> float:
+    own = np.flatnonzero((model.body_weldid[model.geom_bodyid] == group.root) & (model.geom_type == SPHERE))
+    centered = [g for g in own if np.linalg.norm(data.geom_xpos[g] - group.place) < NEAR]
+    return max((float(model.geom_size[g, 0]) for g in centered), default=0.0)
+
+
+def state_of(
+    mujoco: Any, model: Any, reference: Any, groups: dict[int, Group], qpos, qvel
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Positions and velocities of carom's points where MuJoCo has `qpos` and `qvel`."""
+    data = placed(mujoco, model, qpos, qvel)
+    x, v, rates = [], [], np.zeros(6)
+    for group in groups.values():
+        if group.number is None:
+            continue
+        before, now = (part.xmat[group.root].reshape(3, 3) for part in (reference, data))
+        turn = now @ before.T
+        arm = turn @ (group.place - reference.xpos[group.root])
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, group.root, rates, 0)
+        omega, velocity = rates[:3].copy(), rates[3:] + np.cross(rates[:3], arm)
+        axes = jnp.asarray(turn @ group.axes)
+        x.append(embed_pose(jnp.asarray(data.xpos[group.root] + arm), axes))
+        v.append(embed_velocity(axes, jnp.asarray(velocity), jnp.asarray(omega)))
+    return np.concatenate(x), np.concatenate(v)
+
+
+# --- joints ---------------------------------------------------------------------------------------
+
+
+def joints_of(model: Any, data: Any, groups: dict[int, Group]) -> list[Constraint]:
+    """What holds each body to its parent.
+
+    **Raises:** `CaromError` for joints of one body that are not slides followed by hinges through one point.
+    """
+    found = []
+    for group in groups.values():
+        if group.number is not None:
+            parent = groups[int(model.body_weldid[model.body_parentid[group.root]])]
+            start = int(model.body_jntadr[group.root])
+            joints = list(range(start, start + int(model.body_jntnum[group.root])))
+            if model.jnt_type[joints[0]] != FREE:
+                found += _held(model, data, group, parent, joints)
+    return found
+
+
+def _held(model: Any, data: Any, group: Group, parent: Group, joints: list[int]) -> list[Constraint]:
+    types = [int(model.jnt_type[joint]) for joint in joints]
+    slides = [joint for joint, kind in zip(joints, types, strict=True) if kind == SLIDE]
+    turns = [joint for joint, kind in zip(joints, types, strict=True) if kind != SLIDE]
+    name = f"body '{group.name}'"
+    require(
+        joints == slides + turns,
+        f"{name} has the slide joint {name_of(model, 'joint', slides[-1] if slides else 0)} after a hinge or ball "
+        "joint, so that its direction turns; carom has slides that are fixed in the parent. Put the slide first, or "
+        "give it a body of its own.",
+    )
+    require(
+        len(turns) == 1 or all(model.jnt_type[joint] == HINGE for joint in turns),
+        f"{name} has a ball joint and other joints that turn it. Remove these: a ball joint allows all rotations.",
+    )
+    anchors, axes = data.xanchor[turns], data.xaxis[turns]
+    require(
+        bool(np.ptp(anchors, axis=0).max(initial=0) < 1e-6) if turns else True,
+        f"{name} has the hinges {', '.join(name_of(model, 'joint', j) for j in turns)}, which do not meet in one "
+        "point. Move them there, or give each a body of its own.",
+    )
+    for what, rows in (("hinges", axes), ("slides", data.xaxis[slides])):
+        require(
+            np.linalg.matrix_rank(rows, tol=1e-6) == len(rows) if len(rows) else True,
+            f"{name} has {len(rows)} {what} whose axes are not independent. Remove those that add no freedom.",
+        )
+    point = anchors[0] if turns else group.place
+    free_turns = 3 if turns and model.jnt_type[turns[0]] == BALL else len(turns)
+    return [*_positions(group, parent, point, data.xaxis[slides]), *_rotations(group, parent, axes, free_turns)]
+
+
+def _complement(rows: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "e 3"]:
+    """Unit directions at right angles to `rows` and to each other."""
+    return np.eye(3) if len(rows) == 0 else np.linalg.svd(rows)[2][len(rows) :]
+
+
+def _positions(group: Group, parent: Group, point, slides) -> list[Constraint]:
+    """The point of the body stays at that of its parent, but for the slides."""
+    assert group.first is not None
+    weights = place_weights(group.local(point))
+    if len(slides) == 3:
+        return []
+    if len(slides):
+        normals = parent.directions(_complement(slides))
+        return [Track(group.first, weights, normals, parent.local(point), parent.first)]
+    if parent.first is None:
+        return [Joint(group.first, weights, point)]
+    return [Pivot(group.first, weights, parent.first, place_weights(parent.local(point)))]
+
+
+def _rotations(group: Group, parent: Group, axes, free_turns: int) -> list[Constraint]:
+    """Directions that keep their angles: three, two for a hinge, one for two hinges.
+
+    The first of two hinges is fixed in the parent and the second in the body; they keep their angle.
+    """
+    assert group.first is not None
+    if free_turns == 3:
+        return []
+    if free_turns == 2:
+        own, others = axes[1:], axes[:1]
+    elif free_turns == 1:
+        others = _complement(axes)
+        own = np.repeat(axes, 2, axis=0)
+    else:
+        own, others = np.eye(3), np.roll(np.eye(3), -1, axis=0)
+    cosines = np.sum(own * others, axis=1)
+    return [Angles(group.first, group.directions(own), parent.directions(others), cosines, parent.first)]
+
+
+# --- loops ----------------------------------------------------------------------------------------
+
+
+class Loop(NamedTuple):
+    """A `connect` equality: MuJoCo bodies, and where it holds each in its own frame (m)."""
+
+    name: str
+    bodies: tuple[int, int]
+    places: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+
+
+def loops_of(mujoco: Any, model: Any) -> list[Loop]:
+    """The `connect` equalities that act at the start."""
+    if model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        return []
+    found = []
+    for k in range(model.neq):
+        if model.eq_type[k] != mujoco.mjtEq.mjEQ_CONNECT or not model.eq_active0[k]:
+            continue
+        ends = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
+            first, second = (np.array(model.site_pos[s]) for s in ends)
+            ends = int(model.site_bodyid[ends[0]]), int(model.site_bodyid[ends[1]])
+        else:
+            first, second = np.array(model.eq_data[k, :3]), np.array(model.eq_data[k, 3:6])
+        if model.body_weldid[ends[0]] == 0:  # the world, if any, comes second
+            ends, first, second = (ends[1], ends[0]), second, first
+        found.append(Loop(name_of(model, "equality", k), ends, (first, second)))
+    return found
+
+
+def connects_of(
+    mujoco: Any, model: Any, reference: Any, groups: dict[int, Group], loops: list[Loop], qpos
+) -> list[Constraint]:
+    """`connect` equalities, without the equations that follow from the others.
+
+    In a plane linkage of hinges, a loop closes in the plane alone: the third equation of a pivot would follow. Which
+    do is seen in MuJoCo's joint coordinates, at the start and near it.
+
+    **Raises:** `CaromError` where the ends are apart, nothing is left, or the start is a position of its own kind.
+    """
+    moved = np.array(qpos)
+    mujoco.mj_integratePos(model, moved, np.random.default_rng(0).uniform(0.01, 0.02, model.nv), 1.0)
+    start, near = placed(mujoco, model, qpos), placed(mujoco, model, moved)
+    rows, rows_near, found = np.zeros((0, model.nv)), np.zeros((0, model.nv)), []
+    for loop in loops:
+        welds = [groups[int(model.body_weldid[b])] for b in loop.bodies]
+        places = [
+            reference.xpos[b] + reference.xmat[b].reshape(3, 3) @ c
+            for b, c in zip(loop.bodies, loop.places, strict=True)
+        ]
+        mine, normals, gap = _relative(mujoco, model, start, loop, rows)
+        require(
+            gap < 1e-5,
+            f"connect {loop.name} is open by {gap:.3g} m at the start: give a keyframe at which its ends meet.",
+        )
+        mine_near, normals_near, _ = _relative(mujoco, model, near, loop, rows_near)
+        left_out = _complement(normals)
+        require(
+            len(normals) > 0 and bool(np.abs(normals_near @ left_out.T).max(initial=0) < 1e-6),
+            f"connect {loop.name} holds what is held already, or the start is a singular position of its loop (a "
+            "linkage that is stretched out, say). Remove it, or start elsewhere with a keyframe.",
+        )
+        rows, rows_near = np.concatenate([rows, mine]), np.concatenate([rows_near, mine_near])
+        found.append(_closed(welds, places, normals, loop, reference))
+    return found
+
+
+def _relative(mujoco: Any, model: Any, data: Any, loop: Loop, rows):
+    """What a `connect` adds to the equations `rows` (k, nv): its own, their directions in the frame of the second body.
+
+    Also how far its ends are apart (m).
+    """
+    ends, jacobians = [], []
+    for body, place in zip(loop.bodies, loop.places, strict=True):
+        ends.append(data.xpos[body] + data.xmat[body].reshape(3, 3) @ place)
+        jacobians.append(np.zeros((3, model.nv)))
+        mujoco.mj_jac(model, data, jacobians[-1], None, ends[-1], body)
+    frame = data.xmat[loop.bodies[1]].reshape(3, 3)
+    mine = frame.T @ (jacobians[0] - jacobians[1])
+    left = mine - mine @ np.linalg.pinv(rows, rcond=1e-7) @ rows
+    directions, sizes, _ = np.linalg.svd(left)
+    kept = directions.T[: len(sizes)][sizes > 1e-7 * max(float(np.abs(mine).max()), 1e-12)]
+    return kept @ mine, kept, float(np.linalg.norm(ends[0] - ends[1]))
+
+
+def _closed(welds: list[Group], places, normals, loop: Loop, reference: Any) -> Constraint:
+    body, other = welds
+    assert body.first is not None
+    weights = place_weights(body.local(places[0]))
+    if len(normals) == 3:
+        if other.first is None:
+            return Joint(body.first, weights, places[1])
+        return Pivot(body.first, weights, other.first, place_weights(other.local(places[1])))
+    turn = reference.xmat[loop.bodies[1]].reshape(3, 3)
+    return Track(body.first, weights, other.directions(normals @ turn.T), other.local(places[1]), other.first)
