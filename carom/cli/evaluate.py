@@ -70,7 +70,7 @@ class Evaluate:
         told = found and dataclasses.asdict(found)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         with theme("dark" if self.dark else "light"):
-            pictures(run, system, test, predicted)
+            pictures(run, system, test, predicted, found)
         console.print(property_table(system, truth, config["task"] if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))

@@ -287,7 +287,7 @@ class Learn:
                 f"{report.overflowed_contacts} predicted contacts found no place in the solver.",
                 highlight=False,
             )
-        pictures(run, system, test, predicted)
+        pictures(run, system, test, predicted, found)
         seconds = f"{report.seconds:.0f} s for {report.epochs} epochs" + (
             ", stopped early" if report.stopped_early else ""
         )

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from carom.cli.tables import property_names
 from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import trajectory_of
@@ -44,8 +45,10 @@ def what_is_told(
     )
 
 
-def pictures(run: RunFolder, system: System, test: Recording, predicted: Trajectory) -> None:
-    """Draw learning curves, contact properties, error over time, and the animation of one test trajectory."""
+def pictures(
+    run: RunFolder, system: System, test: Recording, predicted: Trajectory, found: Identification | None = None
+) -> None:
+    """Draw learning curves, contact properties, what data tell (`found`), error over time, and a test trajectory."""
     from carom.view import animate, figures  # matplotlib is slow to import
 
     metrics = run.metrics()
@@ -54,6 +57,10 @@ def pictures(run: RunFolder, system: System, test: Recording, predicted: Traject
     if metrics and metrics[-1]["friction"]:
         where, kept = run.path / "contact_properties.png", quantities(system)
         figures.contact_properties(metrics, run.read_json(TRUTH), where, kept=kept)
+    if found is not None and (found.friction or found.restitution or found.mass_ratio):
+        from carom.view.estimates import draw_estimates
+
+        draw_estimates(found, property_names(system), run.path / "estimates.png", truth=run.read_json(TRUTH))
     relative, _ = state_errors(test, predicted)
     figures.trajectory_error(test.time, {"learned": relative}, run.path / "trajectory_error.png")
     k = most_eventful(test)
