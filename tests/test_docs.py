@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -54,12 +55,19 @@ def blocks_of(page: str) -> str:
     [
         pytest.param("index.md", marks=pytest.mark.slow),
         pytest.param("own-system.md", marks=[pytest.mark.slow, pytest.mark.ci_budget]),
+        pytest.param("own-contact.md", marks=[pytest.mark.slow, pytest.mark.ci_budget]),
     ],
 )
 def test_what_is_to_be_copied_works(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "page"}
     exec(compile(blocks_of(page), page, "exec"), names)
+    if page == "own-contact.md":
+        # A step of .005 s at 5 m/s, of which the target velocity takes back an eighth a step.
+        assert float(names["system"].gaps(names["motion"].x).min()) > -0.03
+        assert (np.diff(names["energy"]) < 1e-6).all()  # contacts only take energy, and here little is penetration
+        differences = (names["last_height"](0.6 + 1e-6) - names["last_height"](0.6 - 1e-6)) / 2e-6
+        assert float(names["slope"]) == pytest.approx(float(differences), rel=1e-5)
     if page == "own-system.md":
         assert (tmp_path / "balls.csv").exists()
         friction, restitution = names["report"].friction, names["report"].restitution
