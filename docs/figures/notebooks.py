@@ -2,9 +2,9 @@
 
     python -m docs.figures.notebooks [NOTEBOOK.ipynb ...] [--out FOLDER]
 
-The notebooks in the repository have no outputs. What a cell shows goes into docs/notebooks/shown, as `NOTEBOOK-CELL.png`
-and `NOTEBOOK-CELL.txt`, from where `docs/figures/notebook_pages.py` takes it. With `CAROM_SMALL=1` in the environment
-they run at the tiny sizes of the tests.
+The notebooks in the repository have no outputs. What a cell shows goes into docs/notebooks/shown, as
+`NOTEBOOK-CELL.png` and `NOTEBOOK-CELL.txt`, from where `docs/figures/notebook_pages.py` takes it. With `CAROM_SMALL=1`
+in the environment they run at the tiny sizes of the tests.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 
-from matplotlib import pyplot as plt  # noqa: E402 - not before the choice of Agg
+from matplotlib import pyplot as plt
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
