@@ -117,12 +117,13 @@ class Learn:
             RunFolder.check_new(folder)
             dataset, test = self._data(truth, console)
             run = RunFolder.create(folder, self._description())
-            save_recording(run.path / TEST_DATA, test)
-            run.write_json(TRUTH, quantities(truth))
         else:
             run = RunFolder.open(folder)
             run.check_same(self._description())
             dataset, test = self._data(truth, console)
+        # Resumed too: a kill may have come before them.
+        save_recording(run.path / TEST_DATA, test)
+        run.write_json(TRUTH, quantities(truth))
         console.print(
             f"Learning {self.task} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
             f"{int(dataset.train.length.max())} states into {run.path}",
@@ -154,7 +155,7 @@ class Learn:
             run.check_same(settings)
         else:
             run = RunFolder.create(folder, settings)
-            save_recording(run.path / TEST_DATA, val)
+        save_recording(run.path / TEST_DATA, val)
         console.print(
             f"Learning {self.task} from {data.n_trajectories} recorded tosses into {run.path}",
             soft_wrap=True,
