@@ -1,5 +1,6 @@
 """Run folders: metrics, checkpoints, and what is refused."""
 
+import os
 import re
 from pathlib import Path
 
@@ -41,7 +42,7 @@ def test_a_line_cut_off_by_a_kill_is_left_out_and_a_damaged_one_is_named(run):
     assert run.metrics() == [{"epoch": 1}, {"epoch": 2}]
     for line in (b'{"epoch": 1', b"\xff", b"1", b"{}"):
         path.write_bytes(line + b'\n{"epoch": 2}\n')
-        with pytest.raises(carom.CaromError, match="line 1 of .* is damaged"):
+        with pytest.raises(carom.CaromError, match=r"line 1 of .* is damaged"):
             run.metrics()
 
 
@@ -127,6 +128,18 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path, run):
     (run.path / CONFIG).write_text("{")
     with pytest.raises(carom.CaromError, match="not valid JSON"):
         run.read_json(CONFIG)
+
+
+def test_what_a_kill_left_is_removed_once_it_is_old(tmp_path):
+    old, new, other = (
+        tmp_path / name for name in (f".carom-{'a' * 16}.tmp.h5", f".carom-{'b' * 16}.tmp", ".carom-mine")
+    )
+    for path in (old, new, other):
+        path.touch()
+    for path in (old, other):
+        os.utime(path, (0, 0))
+    write_whole(tmp_path / "file", b"new")
+    assert {path.name for path in tmp_path.iterdir()} == {"file", new.name, other.name}
 
 
 def test_writing_leaves_the_old_file_or_the_new_one(tmp_path):

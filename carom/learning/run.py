@@ -74,8 +74,8 @@ class RunFolder:
         run = cls(path)
         require(
             (run.path / CONFIG).is_file(),
-            f"{run.path} is not a run folder: it has no {CONFIG}. Give a folder that `carom learn` has made; a training "
-            "that was stopped before it had one is started again without --resume.",
+            f"{run.path} is not a run folder: it has no {CONFIG}. Give a folder that `carom learn` has made; a "
+            "training that was stopped before it had one is started again without --resume.",
         )
         return run
 
