@@ -1,12 +1,17 @@
 """Files that are there whole, or as they were before: whatever fails or is killed meanwhile."""
 
 import os
+import re
 import secrets
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from carom.errors import CaromError
+
+LEFTOVER_AGE = 3600.0
+"""Seconds without a write after which a temporary file is taken for one that a kill has left."""
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -32,12 +37,14 @@ def _cannot_write(target: Path, why: object) -> CaromError:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary file next to `path`, which takes its place when the block ends without an error.
 
-    A process that is killed meanwhile may leave a file `.carom-*` there, which can be deleted.
+    A process that is killed meanwhile may leave a file `.carom-*` there. It can be deleted, and is when another file is
+    written there an hour later.
 
     **Raises:** `CaromError` if the folder is missing, full, or not writable.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
     temporary = target.parent / f".carom-{secrets.token_hex(8)}.tmp{target.suffix}"
+    _remove_leftovers(target.parent)
     try:
         yield temporary
         with temporary.open("rb") as file:
@@ -48,6 +55,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove temporary files that nobody has written to for an hour: their process was killed."""
+    with suppress(OSError):
+        for entry in folder.glob(".carom-*.tmp*"):
+            ours = re.fullmatch(r"\.carom-[0-9a-f]{16}\.tmp(\.\w+)?", entry.name)
+            if ours and time.time() - entry.stat().st_mtime > LEFTOVER_AGE:
+                entry.unlink(missing_ok=True)
 
 
 def write_whole(path: str | os.PathLike[str], data: bytes | memoryview) -> None:

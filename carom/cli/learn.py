@@ -158,14 +158,15 @@ class Learn:
             RunFolder.check_new(folder)
             dataset, test = self.data_sets(chosen, console)
             run = RunFolder.create(folder, self._description(chosen))
-            save_recording(run.path / TEST_DATA, test)
-            run.write_json(TRUTH, None if chosen.truth is None else quantities(truth))
-            if chosen.source is not None:
-                write_whole(run.path / SYSTEM, chosen.source)
         else:
             run = RunFolder.open(folder)
             run.check_same(self._description(chosen))
             dataset, test = self.data_sets(chosen, console)
+        # Resumed too: a kill may have come before them.
+        if chosen.source is not None:
+            write_whole(run.path / SYSTEM, chosen.source)
+        save_recording(run.path / TEST_DATA, test)
+        run.write_json(TRUTH, None if chosen.truth is None else quantities(truth))
         console.print(
             f"Learning {chosen.name} ({self.config.model}) from {dataset.train.n_trajectories} trajectories of "
             f"{int(dataset.train.length.max())} states into {run.path}",
@@ -197,7 +198,7 @@ class Learn:
             run.check_same(settings)
         else:
             run = RunFolder.create(folder, settings)
-            save_recording(run.path / TEST_DATA, val)
+        save_recording(run.path / TEST_DATA, val)
         console.print(
             f"Learning {self.task} from {data.n_trajectories} recorded tosses into {run.path}",
             soft_wrap=True,

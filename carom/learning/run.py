@@ -6,14 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
+from carom.learning.checkpoints import Checkpoints
 
 CONFIG, TRUTH, METRICS, REPORT, MODEL, SYSTEM = (
     "config.json",
@@ -33,7 +32,7 @@ class RunFolder:
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
-        self._manager: Any = None
+        self._checkpoints = Checkpoints(self.path / "checkpoints")
 
     @staticmethod
     def check_new(path: str | os.PathLike) -> None:
@@ -79,7 +78,8 @@ class RunFolder:
         run = cls(path)
         require(
             (run.path / CONFIG).is_file(),
-            f"{run.path} is not a run folder: it has no {CONFIG}. Give a folder that `carom learn` has made.",
+            f"{run.path} is not a run folder: it has no {CONFIG}. Give a folder that `carom learn` has made; a "
+            "training that was stopped before it had one is started again without --resume.",
         )
         return run
 
@@ -113,7 +113,7 @@ class RunFolder:
         """The content of a JSON file of the run."""
         path = self.path / name
         try:
-            return json.loads(path.read_text())
+            return json.loads(path.read_bytes())
         except OSError as error:
             raise CaromError(f"cannot read {path}: {error.strerror}. Was the run finished?") from error
         except ValueError as error:
@@ -127,24 +127,32 @@ class RunFolder:
 
     def log(self, metrics: dict[str, Any]) -> None:
         """Append one line to `metrics.jsonl`; numbers that are not finite are written as null."""
-        with (self.path / METRICS).open("a") as file:
-            file.write(json.dumps(_finite(metrics)) + "\n")
+        path = self.path / METRICS
+        whole, rest = self._lines()
+        if rest:  # what a kill has left of a line: another must not begin in it
+            os.truncate(path, len(whole))
+        with path.open("ab") as file:
+            file.write(json.dumps(_finite(metrics)).encode() + b"\n")
 
     def metrics(self) -> list[dict[str, Any]]:
         """All lines of `metrics.jsonl`; a last line cut off by a kill is left out."""
-        path = self.path / METRICS
-        if not path.exists():
-            return []
-        lines = path.read_text().splitlines()
         out = []
-        for number, line in enumerate(lines):
+        for number, line in enumerate(self._lines()[0].splitlines()):
             try:
                 out.append(json.loads(line))
-            except ValueError as error:
-                if number == len(lines) - 1:
-                    break
-                raise CaromError(f"line {number + 1} of {path} is not valid JSON: remove or restore it.") from error
+            except ValueError:
+                out.append(None)
+            require(
+                isinstance(out[-1], dict) and "epoch" in out[-1],
+                f"line {number + 1} of {self.path / METRICS} is damaged: restore the file, or remove the line.",
+            )
         return out
+
+    def _lines(self) -> tuple[bytes, bytes]:
+        """The whole lines of `metrics.jsonl`, and what of a last one was written before a kill."""
+        path = self.path / METRICS
+        whole, end, rest = (path.read_bytes() if path.exists() else b"").rpartition(b"\n")
+        return whole + end, rest
 
     def rewind_metrics(self, epoch: int) -> None:
         """Drop the lines after `epoch`: they will be made again."""
@@ -153,66 +161,20 @@ class RunFolder:
 
     # --- checkpoints -----------------------------------------------------------------------------------------
 
-    @property
-    def _checkpoints(self):
-        if self._manager is None:
-            import orbax.checkpoint as ocp  # slow to import, and only a training needs it
-
-            # Of several processes the first alone writes, and waits for no other.
-            alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0})
-            options = ocp.CheckpointManagerOptions(
-                max_to_keep=2, enable_async_checkpointing=False, multiprocessing_options=alone, create=False
-            )
-            folder = (self.path / "checkpoints").absolute()
-            folder.mkdir(exist_ok=True)
-            self._manager = ocp.CheckpointManager(folder, options=options)
-        return self._manager
-
     def save_checkpoint(self, epoch: int, state: Any) -> None:
         """Save the arrays of `state`. A kill at any time leaves the one before."""
-        import orbax.checkpoint as ocp
-
-        self._checkpoints.save(epoch, args=ocp.args.StandardSave(_leaves(state)))
+        self._checkpoints.save(epoch, state)
 
     def restore_checkpoint(self, like: Any) -> Any:
-        """The latest checkpoint in the form of `like`, or `None` if there is none.
+        """The latest sound checkpoint in the form of `like`, or `None` if there is none; a damaged one is warned of.
 
-        **Raises:** `CaromError` if it does not fit, or cannot be read.
+        **Raises:** `CaromError` if it does not fit, or all are damaged.
         """
-        import orbax.checkpoint as ocp
-
-        epoch = self._checkpoints.latest_step()
-        if epoch is None:
-            return None
-        leaves = _leaves(like)
-        try:
-            restored = self._checkpoints.restore(epoch, args=ocp.args.StandardRestore(leaves))
-        except Exception as error:  # orbax raises many types for a damaged or foreign checkpoint
-            raise CaromError(
-                f"the checkpoint of epoch {epoch} in {self.path} cannot be restored "
-                f"({str(error).splitlines()[0] if str(error) else type(error).__name__}). Delete the folder "
-                f"{self.path / 'checkpoints' / str(epoch)} to go on from an earlier one, or start a new run."
-            ) from error
-        arrays, rest = eqx.partition(like, eqx.is_array)
-        flat, structure = jax.tree.flatten(arrays)
-        # Without orbax's placement on a device, so that the programs compiled for fresh arrays take them.
-        values = [jnp.asarray(np.asarray(restored.get(f"{k:04d}", leaf))) for k, leaf in enumerate(flat)]
-        return eqx.combine(jax.tree.unflatten(structure, values), rest)
+        return self._checkpoints.restore(like)
 
     def close(self) -> None:
         """Finish what is being written."""
-        if self._manager is not None:
-            self._manager.close()
-            self._manager = None
-
-
-def _leaves(tree: Any) -> dict[str, np.ndarray]:
-    """The arrays of a tree by their number. Those without elements, which orbax refuses, are left out.
-
-    NumPy's: of several processes the first alone writes, which orbax refuses to do with arrays of JAX.
-    """
-    leaves = enumerate(jax.tree.leaves(eqx.filter(tree, eqx.is_array)))
-    return {f"{k:04d}": np.asarray(leaf) for k, leaf in leaves if leaf.size}
+        self._checkpoints.close()
 
 
 def _finite(value: Any) -> Any:

@@ -190,7 +190,7 @@ class _Training:
         if run is not None and restored is not None:
             self.state = restored
             run.rewind_metrics(int(restored.epoch))
-        elif run is not None and run.metrics():  # killed before its first checkpoint
+        elif run is not None:  # it may have been killed before its first checkpoint
             run.rewind_metrics(-1)
         self.state = from_first(self.state)
         self.resumed = bool(from_first(jnp.asarray(restored is not None)))
@@ -204,9 +204,11 @@ class _Training:
         self.speed = float(np.sqrt(np.mean(train.v[train.valid] ** 2)))
         self.enough = config.enough * self.speed
         self.held_out = _validation_chunks(dataset.val, skeleton, config)
-        last = run.metrics()[-1] if run is not None and self.resumed else {"seconds": 0.0}
-        self.started = time.monotonic() - last["seconds"]
-        self.loss = float(last.get("loss", np.nan))
+        before = run.metrics() if run is not None and self.resumed else []
+        last = before[-1] if before else {}
+        self.started = time.monotonic() - last.get("seconds", 0.0)
+        loss = last.get("loss")  # null where it was not finite
+        self.loss = np.nan if loss is None else float(loss)
         self.refines = config.refine and can_be_refined(self.state.unknowns, self.trained)
         self.refine_at = round(REFINE_AFTER * config.epochs)
         self.refinements = itertools.count(1)  # before the first epoch, for the log

@@ -101,9 +101,13 @@ def contact_jump(
     rows = active.jacobian.reshape(k * d, system.n_points, d)
     response = jnp.einsum("ij,rjd->rid", inverse_mass, rows)  # M^-1 J_C^T
     saddle = SaddlePoint(jax.jacrev(system.constraints)(x), inverse_mass) if system.links else None
-    if saddle is not None:
-        response = saddle.project(response)
-    delassus = jnp.einsum("rid,sid->rs", rows, response)
+    if saddle is None:
+        delassus = jnp.einsum("rid,sid->rs", rows, response)
+    else:
+        free = jnp.einsum("rid,rid->r", rows, response)
+        # Twice: the rounding of the first, which a large impulse shows, is an error that the second takes away.
+        response = saddle.project(saddle.project(response))
+        rows, response, delassus = _held(rows, response, free, d, system.mass_matrix())
     delassus = (delassus + delassus.T) / 2
     velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
     friction = system.friction[active.property_index]
@@ -128,6 +132,29 @@ def contact_jump(
         restitution=system.restitution[active.property_index],
     )
     return contacts, system.contact_model(contacts, smoothing=stepper.smoothing)
+
+
+def _held(
+    rows: Float[Array, "r n d"],
+    response: Float[Array, "r n d"],
+    free: Float[Array, " r"],
+    d: int,
+    mass: Float[Array, "n n"],
+) -> tuple[Float[Array, "r n d"], Float[Array, "r n d"], Float[Array, "r r"]]:
+    """Rows and responses `R = M^^-1 J_C^T` of contacts on bodies that joints hold, and their Delassus matrix.
+
+    The matrix is taken as the square that it is, `R^T M R`. `J_C R`, in which joints may leave little of `free`, the
+    diagonal without them, has the rounding of that and would not be positive semi-definite.
+
+    A contact whose normal the joints hold for themselves, as below a pendulum that hangs straight, can do nothing: of
+    its mobility there is rounding, the share eps of `free`, and an impulse over that would be any. It becomes padding.
+    """
+    delassus = jnp.einsum("rid,sid->rs", response, jnp.einsum("ij,sjd->sid", mass, response))
+    moves = jnp.diagonal(delassus)[::d] > jnp.finfo(free.dtype).eps * free[::d]
+    moves = jnp.repeat(moves, d)
+    both = jnp.asarray(moves[:, None] & moves)
+    rows, response = (jnp.asarray(jnp.where(moves[:, None, None], part, 0)) for part in (rows, response))
+    return rows, response, jnp.asarray(jnp.where(both, delassus, 0))
 
 
 def impact_at(
