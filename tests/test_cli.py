@@ -339,7 +339,9 @@ def test_a_program_to_start_from(tmp_path, capsys):
 def test_the_program_to_start_from_runs(tmp_path):
     command("new", "mine.py")
     environment = {**os.environ, "PYTHONPATH": str(Path(carom.__file__).parents[1])}
-    done = subprocess.run([sys.executable, "mine.py"], capture_output=True, text=True, check=True, env=environment)
+    for words in ([], ["learn"]):
+        program = [sys.executable, "mine.py", *words]
+        done = subprocess.run(program, capture_output=True, text=True, check=True, env=environment)
     found = re.findall(r"restitution 1: (\S+) .* identified", done.stdout)
     assert float(found[0]) == pytest.approx(0.5, abs=1e-3)
-    assert Path("motions.h5").exists()
+    assert Path("motions.csv").exists()

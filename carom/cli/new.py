@@ -15,8 +15,8 @@ from carom.checks import require
 class New:
     """Write a commented Python program: a system of your own, simulated, learned again, and looked at.
 
-    It runs as it is (`python FILE`, about a minute the first time): change it from there. `carom learn FILE --data
-    MOTIONS` learns its system from a file of yours.
+    It runs as it is: `python FILE` writes motions.csv, from which `carom learn FILE --data motions.csv` learns the
+    system. Change it from there.
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
@@ -33,4 +33,7 @@ class New:
         )
         require(self.force or not self.file.exists(), f"{self.file} is there already: choose another, or add --force.")
         write_whole(self.file, (resources.files("carom.cli") / "new_system.txt").read_bytes())
-        print(f"Written to {self.file}. Try it: python {self.file}")
+        print(
+            f"Written to {self.file}. Try it: python {self.file}, which writes motions.csv, then\n"
+            f"carom learn {self.file} --data motions.csv"
+        )
