@@ -97,9 +97,8 @@ class Learn:
     def _of_run(cls, run: RunFolder) -> "Learn":
         kept = run.read_json(CONFIG)
         try:
-            options = {f.name: kept[f.name] for f in dataclasses.fields(LearnConfig)}
-            config = LearnConfig(**{**options, "learn": tuple(options["learn"])})
-            tosses = TossConfig(**kept["tosses"]) if kept.get("tosses") else TossConfig()
+            config = LearnConfig(**_tuples({f.name: kept[f.name] for f in dataclasses.fields(LearnConfig)}))
+            tosses = TossConfig(**_tuples(kept["tosses"])) if kept.get("tosses") else TossConfig()
             files = {name: kept[name] and Path(kept[name]) for name in ("data", "val", "test")}
             others = {name: kept[name] for name in ("trajectories", "data_contact_model", "data_noise")}
         except (KeyError, TypeError) as error:
@@ -302,6 +301,11 @@ Learn.RARE = {  # pyright: ignore[reportAttributeAccessIssue]
     LearnConfig: tuple(f.name for f in dataclasses.fields(LearnConfig) if f.name not in COMMON),
     TossConfig: tuple(f.name for f in dataclasses.fields(TossConfig)),
 }
+
+
+def _tuples(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as they were before JSON made lists of tuples."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
 
 
 def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
