@@ -145,6 +145,8 @@ def test_tables_are_written_with_what_is_there(tmp_path):
     assert "| 0 | cp3 mu | 0.5 | 0.5 | 0.5 |" in text
     assert "1 of 2 cells are at least as good" in text
     whole = page(tmp_path / "results")
+    assert "Where carom is worse" in whole
+    assert "0, cp3 e: 0.5 (paper " in whole
     assert "Of 2 cells that can be compared 1 are" in whole
     assert text in whole
 

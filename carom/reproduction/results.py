@@ -297,6 +297,19 @@ def markdown(content: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _worse(content: dict[str, Any]) -> list[str]:
+    """The cells of a table that count and are worse than the paper's, in a line."""
+    cells = [cell for cell in content["cells"] if cell["verdict"] == "worse" and cell.get("counted", True)]
+    if not cells:
+        return []
+    listed = "; ".join(
+        f"{cell['row']}, {cell['column']}: {_number(cell['error']) or cell['note']} "
+        f"(paper {_number(cell['paper_error'])})"
+        for cell in cells
+    )
+    return [f"* {content['title']}. {listed}."]
+
+
 def page(folder: Path) -> str:
     """The page of all tables that the folder has."""
     lines = [
@@ -310,17 +323,23 @@ def page(folder: Path) -> str:
         "",
     ]
     total = {"compared": 0, "met": 0, "better": 0}
-    parts = []
+    parts, worse = [], []
     for name in BUILDERS:
         path = folder / f"{name}.json"
         if path.exists():
             content = json.loads(path.read_text())
             parts.append(markdown(content))
             total = {key: total[key] + content["summary"][key] for key in total}
+            worse += _worse(content)
     lines += [
         f"Of {total['compared']} cells that can be compared {total['met']} are at least as good as the paper's, and "
         f"{total['better']} at least three times better.",
         "",
+        *(
+            ["## Where carom is worse", "", "Errors; what they are due to stands below each table.", "", *worse, ""]
+            if worse
+            else []
+        ),
     ]
     return "\n".join([*lines, "\n".join(parts)])
 
