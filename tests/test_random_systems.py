@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cone_problems import apply, kkt_residual
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis.extra import numpy as hnp
 from jaxtyping import Array, Bool, Float, Int
 from systems import disk, sphere
@@ -26,7 +26,8 @@ from carom.mechanics.bodies import embed_pose, embed_velocity
 from carom.mechanics.dynamics import saddle_point
 from carom.simulation.impact import Stepper, contact_jump
 
-BATCH, EXAMPLES = 8, 10
+BATCH = 8
+NO_SHRINK = [Phase.explicit, Phase.generate]  # shrinking a batch takes minutes, and tells little
 NUMBERS = 48
 """Numbers that a system with its state is made from."""
 
@@ -273,9 +274,13 @@ def assert_optimal(found: Impact, dtype) -> None:
     compression, rebound = found.impulse[:, 0], found.impulse[:, 1]
     bounds = np.full_like(found.friction, -np.inf), found.restitution * np.maximum(compression[..., 0], 0)
     between = found.velocity + apply(found.delassus, compression) - found.target
-    first = kkt_residual(found.delassus, found.velocity, found.friction, bounds[0], compression)
-    second = kkt_residual(found.delassus, between, found.friction, bounds[1], rebound, reference=found.velocity)
     tolerance = ConeSettings.for_dtype(dtype).tolerance  # at which the solver stops
+    # Residuals are relative to the largest velocity, but cannot be less than what rounding makes of the speeds: a ball
+    # that is held between the ends of a dumbbell neither approaches them nor leaves.
+    speed = np.max(np.abs(found.v), axis=(1, 2)) * float(jnp.finfo(dtype).eps) / tolerance
+    known = np.maximum(np.abs(found.velocity), speed[:, None, None])
+    first = kkt_residual(found.delassus, found.velocity, found.friction, bounds[0], compression, reference=known)
+    second = kkt_residual(found.delassus, between, found.friction, bounds[1], rebound, reference=known)
     assert max(first.max(), second.max()) < tolerance
     assert not np.any(found.impulse[~np.broadcast_to(found.active[:, None], found.impulse.shape[:3])])
 
@@ -296,8 +301,8 @@ def assert_mechanics(found: Impact, eps: float, *, walls: bool, compensated: boo
     if not walls:
         change = np.einsum("bij,bjd->bd", found.mass, found.after - found.v)
         # A momentum is such a sum too.
-        allowed = 10 * eps * np.einsum("bij,bjd->bd", np.abs(found.mass), terms)
-        assert (np.abs(change) <= allowed).all()
+        allowed = 10 * eps * np.einsum("bij,bj->b", np.abs(found.mass), np.linalg.norm(terms, axis=2))
+        assert (np.abs(change) <= allowed[:, None]).all()
     if not compensated:
         # With T the change of kinetic energy, T(f) = f A f / 2 + f v. Compression f_c has f_c (v + A f_c) = 0 contact
         # by contact, so T(f_c) = -f_c A f_c / 2. Of all rebounds allowed, f_c itself is one for e <= 1 and gives
@@ -307,22 +312,32 @@ def assert_mechanics(found: Impact, eps: float, *, walls: bool, compensated: boo
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("make", STRUCTURES)
+def test_what_holds_at_every_impact(make, dtype):
+    holds_at_every_impact(make, dtype, examples=100)
+
+
+@pytest.mark.slow
 @pytest.mark.ci_budget
 @pytest.mark.parametrize(
     ("make", "dtype"),
     [
-        *((make, jnp.float64) for make in STRUCTURES),
-        (three_disks, jnp.float32),
+        (three_disks, jnp.float64),
+        (ball_and_dumbbell, jnp.float64),
+        (pendulum_on_the_ground, jnp.float64),
         (pendulum_on_the_ground, jnp.float32),
-        *(pytest.param(make, jnp.float32) for make in (ball_and_dumbbell, ball_in_a_corner)),
     ],
-    ids=lambda part: part.__name__,
 )
-def test_what_holds_at_every_impact(make, dtype):
+def test_what_holds_at_some_impacts(make, dtype):
+    holds_at_every_impact(make, dtype, examples=10)
+
+
+def holds_at_every_impact(make, dtype, examples: int) -> None:
     eps = float(jnp.finfo(dtype).eps)
 
     @given(values=batches(), compensation=st.sampled_from([np.inf, 8.0, 1.0]))
-    @settings(max_examples=EXAMPLES, deadline=None, database=None, derandomize=True)
+    @settings(max_examples=examples, deadline=None, phases=NO_SHRINK, database=None, derandomize=True)
     def holds(values, compensation):
         found, slope, _ = impacts_of(make, values, dtype, compensation)
         for name, value in (*found._asdict().items(), ("slope", slope)):
@@ -341,7 +356,7 @@ def test_what_holds_at_every_impact(make, dtype):
 
 @pytest.mark.slow
 @pytest.mark.ci_budget
-@pytest.mark.parametrize("make", [three_disks, pendulum_on_the_ground])
+@pytest.mark.parametrize("make", [pendulum_on_the_ground])
 def test_a_batch_is_its_single_impacts(make):
     @given(values=batches(), compensation=st.sampled_from([np.inf, 8.0]))
     @settings(max_examples=5, deadline=None, database=None, derandomize=True)
