@@ -79,7 +79,7 @@ def test_runs(notebook, tmp_path):
     cache = jax.config.jax_compilation_cache_dir
     environment = {**os.environ, "CAROM_SMALL": "1", "MPLBACKEND": "Agg"}
     if cache:
-        environment |= {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5"}
+        environment |= {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     command = [sys.executable, "-m", "docs.figures.notebooks", str(notebook), "--out", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr[-3000:]
