@@ -151,9 +151,9 @@ def test_coulomb_obeys_the_law_and_cm_lifts_what_slides():
 
     assert lift(carom.CM())[0] > 0.1
     (first, _), (second, _), (third, against_sliding) = (lift(carom.Coulomb(iterations=n)) for n in (1, 4, 16))
-    assert second < first / 5
-    assert third < 1e-4
-    assert against_sliding < 1e-4
+    assert second < first / 100
+    assert third < 1e-6
+    assert against_sliding < 1e-6
 
 
 def one_contact(speed, sliding, friction, restitution):
@@ -172,9 +172,12 @@ def one_contact(speed, sliding, friction, restitution):
 def test_one_sliding_contact_by_hand():
     """Poisson: the impulse is (1 + e) u_n, and friction mu of it; CM's is larger by what it lifts."""
     state = one_contact(1.0, 2.0, 0.3, 0.5)
-    assert np.allclose(impulses(carom.Coulomb(), state)[0, 0], [1.5, -0.45], atol=1e-3)
-    assert np.allclose(impulses(carom.Coulomb(iterations=12), state)[0, 0], [1.5, -0.45], atol=1e-8)
+    for model in (carom.Coulomb(iterations=3), carom.Coulomb(), carom.Coulomb(iterations=12)):
+        assert np.allclose(impulses(model, state)[0, 0], [1.5, -0.45], atol=1e-8)
     assert impulses(carom.CM(), state)[0, 0, 0] > 1.8
+    # So much friction that to take the speed that came out as the next would lead away from the solution.
+    rough = one_contact(1.0, 9.0, 1.6, 0.5)
+    assert np.allclose(impulses(carom.Coulomb(), rough)[0, 0], [1.5, -2.4], atol=1e-7)
 
 
 @pytest.mark.slow
@@ -184,7 +187,7 @@ def test_fast_impacts_have_less_friction_and_restitution():
     lost = 1 - np.exp(-speed / pace)
 
     def jump(friction_loss, restitution_loss):
-        model = carom.Coulomb(friction_loss, restitution_loss, pace, iterations=12)
+        model = carom.Coulomb(friction_loss, restitution_loss, pace)
         return impulses(model, one_contact(speed, 3.0, mu, e))[0, 0]
 
     normal = speed * (1 + e * (1 - losses[1] * lost))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.checks import as_floats, require
+from carom.checks import as_floats, require, require_values
 from carom.contact.geometry import Touch, deepest_direction, sphere_plane, sphere_sphere
 from carom.mechanics.bodies import BodyTable
 
@@ -87,7 +87,7 @@ def plane(name: str, point, normal) -> tuple[Float[Array, " d"], Float[Array, " 
         f"{name} point and normal must be vectors of 2 or 3 numbers; their shapes were {point.shape} and "
         f"{normal.shape}.",
     )
-    require(bool(length > 0), f"{name} normal must not be zero: give the direction out of the solid side.")
+    require_values(f"{name} normal", normal, length > 0, "the direction out of the solid side, which is not zero")
     return point, normal / length
 
 
