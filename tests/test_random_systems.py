@@ -61,7 +61,7 @@ class Numbers:
         return np.array([np.sin(polar) * np.cos(around), np.cos(polar), np.sin(polar) * np.sin(around)])
 
     def depth(self, radius: float) -> float:
-        return radius * self.take(1e-6, 0.2)
+        return radius * self.take(1e-4, 0.2)  # at least 5e-6 m, which single precision resolves at these distances
 
     def rotation(self, dim: int) -> np.ndarray:
         angles = [self.take(-np.pi, np.pi) for _ in range(1 if dim == 2 else 3)]
