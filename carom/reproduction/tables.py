@@ -38,8 +38,9 @@ LATER = "not run: the solver is not yet made for so many points"
 LCP_NOTE = (
     "What the paper's LCP is, it does not say. carom's is that of Coulomb's law: a contact that slides stays down, "
     "where in CM it lifts. First reading: learned with the contact model coulomb, which has no lift either, but cones "
-    "and Poisson's restitution where the LCP has pyramids and Newton's; so a mismatch is left. Predictions on CM data "
-    "are made with CM. Other readings, not counted: learned with CM, which with friction cannot be right, and with the "
+    "and Poisson's restitution where the LCP has pyramids and Newton's: for cp3, in 2D and without restitution, the "
+    "same, but for gyro a mismatch of some per cent of an impact's velocities is left. Predictions on CM data are made "
+    "with CM. Other readings, not counted: learned with CM, which with friction cannot be right, and with the "
     "LCP itself, whose gradients were NaN in the paper."
 )
 LCP_READINGS = {"": "coulomb", ", learned with CM": "cm", ", learned with LCP": "lcp"}
