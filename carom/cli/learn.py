@@ -38,7 +38,7 @@ QUICK = {"trajectories": 100, "epochs": 20}
 """What `--quick` makes smaller, where it is not set by hand."""
 
 
-COMMON = ("model", "epochs", "contact_model", "chunk_length", "seed")
+COMMON = ("model", "epochs", "contact_model", "seed")
 """Options of `LearnConfig` that most users want."""
 
 
