@@ -127,6 +127,7 @@ def test_learn_writes_a_whole_run_folder(killed):
         "learning_curves.png",
         "contact_properties.png",
         "trajectory_error.png",
+        "estimates.png",
         "prediction.gif",
     }
     config = json.loads((learned / "config.json").read_text())

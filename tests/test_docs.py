@@ -54,7 +54,7 @@ def blocks_of(page: str) -> str:
     "page",
     [
         pytest.param("index.md", marks=pytest.mark.slow),
-        pytest.param("own-system.md", marks=[pytest.mark.slow, pytest.mark.ci_budget]),
+        pytest.param("own-system.md", marks=pytest.mark.slow),
         pytest.param("own-contact.md", marks=[pytest.mark.slow, pytest.mark.ci_budget]),
     ],
 )
