@@ -11,6 +11,8 @@ from carom.view.style import PALETTE, figure_style, log_axis, new_figure, save_p
 LABELS = {"state": "relative error of the state", "energy": "error of the energy / largest kinetic energy"}
 FLOOR = 1e-16
 """Errors below rounding are drawn there."""
+LARGEST = 100.0
+"""Errors above this, of predictions that are lost, leave the picture."""
 DASHED = (0, (4, 1.5))
 
 
@@ -35,10 +37,14 @@ def draw(content: dict[str, Any], quantity: str, path: Path) -> Path:
                 time = curve["dt"] * np.arange(1, len(mean) + 1)
                 lost = ~np.isfinite(mean)
                 mean = np.where(lost, np.nan, np.maximum(mean, FLOOR))
-                color, dashes = PALETTE[k % len(PALETTE)], "-" if k < len(PALETTE) else DASHED
+                # Lagrangian and Hamiltonian often agree: both are to be seen where one lies on the other.
+                dashed = k >= len(PALETTE) or "CHNN" in curve["row"]
+                color, dashes = PALETTE[k % len(PALETTE)], DASHED if dashed else "-"
                 axes.plot(time, mean, color=color, linestyle=dashes, label=curve["row"], lw=1.3)
                 half = np.where(np.isfinite(half), half, 0)
                 axes.fill_between(time, np.maximum(mean - half, mean / 10), mean + half, color=color, alpha=0.15, lw=0)
+        for axes in panels:
+            axes.set_ylim(top=min(axes.get_ylim()[1], LARGEST))
         for axes in panels[len(tasks) - columns : len(tasks)]:
             axes.set_xlabel("time (s)")
         figure.supylabel(LABELS[quantity], fontsize=9)
