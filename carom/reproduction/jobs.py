@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -118,6 +119,7 @@ class Job:
                 "provenance": {
                     "digest": self.digest(quick),
                     "seconds": round(time.monotonic() - started, 1),
+                    "commit": commit(),
                     "carom": carom.__version__,
                     "jax": jax.__version__,
                 },
@@ -157,3 +159,18 @@ class Job:
             rng = np.random.default_rng((self.seed, 17))
             train, val = (noisy(self.task, part, self.noise, rng) for part in (train, val))
         return Dataset(train, val), tests
+
+
+def commit() -> str | None:
+    """The commit of the checkout that the package is in, if it is in one."""
+    try:
+        out = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return out.stdout.strip()

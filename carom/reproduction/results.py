@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import platform
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +120,7 @@ def collect(
         "cells": cells,
         "summary": summary(cells),
         "runs": {job.name: report["provenance"] for job, report in reports.items()}
-        | {job.name: run for job, run in kept.items()},
-        "commit": commit(),
+        | {job.name: {"commit": None, **run} for job, run in kept.items()},
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
         **({"over_time": curves} if curves else {}),
     }
@@ -192,21 +190,6 @@ def summary(cells: list[dict[str, Any]]) -> dict[str, int]:
         "met": sum(verdict in ("met", "better") for verdict in verdicts),
         "better": verdicts.count("better"),
     }
-
-
-def commit() -> str | None:
-    """The commit of the checkout that the package is in, if it is in one."""
-    try:
-        out = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return out.stdout.strip()
 
 
 def written(name: str, folder: Path) -> dict[str, Any] | None:
@@ -287,14 +270,22 @@ def markdown(content: dict[str, Any]) -> str:
     if "over_time" in content:
         lines += [""] + [f"![{name.removesuffix('.png')}](images/{name})" for name in PICTURES.values()]
     if content["runs"]:
+        commits = sorted({run["commit"] for run in content["runs"].values() if run.get("commit")})
         seconds = sum(run["seconds"] for run in content["runs"].values())
         lines += [
             "",
-            f"{len(content['runs'])} trainings, {seconds / 60:.0f} minutes together; {content['machine']}"
-            + (f"; commit {content['commit']}" if content["commit"] else "")
+            f"{len(content['runs'])} trainings ({_seeds(content)}), {seconds / 60:.0f} minutes together; "
+            f"{content['machine']}"
+            + (f"; commit {', '.join(commits)}" if commits else "")
             + f". `carom reproduce {content['table']}`.",
         ]
     return "\n".join(lines) + "\n"
+
+
+def _seeds(content: dict[str, Any]) -> str:
+    """Which seeds a table is of."""
+    found = sorted({int(seed) for cell in content["cells"] for seed in cell.get("by_seed", {})})
+    return "seed 0 alone" if found == [0] else f"seeds {', '.join(map(str, found))}"
 
 
 def _worse(content: dict[str, Any]) -> list[str]:
