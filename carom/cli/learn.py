@@ -31,7 +31,6 @@ from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.learning.tosses import TossConfig, can_learn_tosses
 from carom.learning.train import LearnReport, learn, quantities
 from carom.simulation.files import Recording, load_recording, save_recording
-from carom.system import System
 from carom.tasks import make_data_sets, noisy
 
 QUICK = {"trajectories": 100, "epochs": 20}
@@ -147,7 +146,7 @@ class Learn:
         )
         require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
         if self.data is not None and can_learn_tosses(truth):
-            self._run_tosses(console, truth)
+            self._run_tosses(console, chosen)
             return
         if not is_first():
             learn(truth, self.data_sets(chosen, console)[0], self.config, progress=False)
@@ -178,7 +177,7 @@ class Learn:
             run.close()
         self._finish(console, run, system, report, chosen, dataset, test)
 
-    def _run_tosses(self, console: Console, skeleton: System) -> None:
+    def _run_tosses(self, console: Console, chosen: Chosen) -> None:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
         self.tosses.check()
         require(self.process_count == 1, f"process_count must be 1 for recorded tosses; it was {self.process_count}.")
@@ -191,7 +190,7 @@ class Learn:
             data, val = parts.train, parts.val
         else:
             val = load_recording(self.val, task=self.task)
-        settings = {**self._description(self._chosen()), "tosses": dataclasses.asdict(self.tosses)}
+        settings = {**self._description(chosen), "tosses": dataclasses.asdict(self.tosses)}
         if self.resume:
             run = RunFolder.open(folder)
             run.check_same(settings)
@@ -203,7 +202,7 @@ class Learn:
             soft_wrap=True,
             highlight=False,
         )
-        learn_and_measure(console, run, skeleton, data, val, self.tosses)
+        learn_and_measure(console, run, chosen.system, data, val, self.tosses)
 
     def _chosen(self) -> Chosen:
         """The system to learn, under the name that it was first given."""

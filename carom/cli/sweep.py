@@ -24,7 +24,7 @@ from carom.cli.search_space import Space, grid, parse_space, words_of
 from carom.cli.systems import Chosen, choose
 from carom.errors import CaromError
 from carom.learning.config import LearnConfig
-from carom.learning.run import CONFIG, REPORT, RunFolder
+from carom.learning.run import CONFIG, REPORT, RunFolder, check_same_settings
 from carom.simulation.files import save_recording
 
 Objective = Literal["bounded_error", "trajectory_error", "trajectory_error_median", "trajectory_error_geometric"]
@@ -118,12 +118,7 @@ class Sweep:
                 before = json.loads(path.read_text())
             except ValueError as error:
                 raise CaromError(f"{path} is not valid JSON ({error}): restore it, or take another --out.") from error
-            for name in settings:
-                require(
-                    before.get(name) == settings[name],
-                    f"the sweep in {folder} was started with {name} = {before.get(name)!r}, not {settings[name]!r}. "
-                    "Use the same options to go on with it, or another --out.",
-                )
+            check_same_settings(f"the sweep in {folder}", before, settings)
             return
         learn = Learn(
             self.task,

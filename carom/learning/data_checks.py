@@ -9,6 +9,9 @@ from carom.learning.dataset import Dataset, closed_contacts
 from carom.simulation.files import Recording
 from carom.system import System
 
+LARGEST_DRIFT = 5e-2
+"""Recorded constraints that are off by more (m^2) are of another system."""
+
 
 def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
     """Raise `CaromError` where data and skeleton do not fit; return the largest number of contacts closed at once."""
@@ -27,9 +30,8 @@ def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> in
     for name, part in (("train", dataset.train), ("val", dataset.val)):
         valid = part.valid
         drift = np.abs(np.asarray(skeleton.constraints(jnp.asarray(part.x[valid]))))
-        limit = 5e-2
         require(
-            drift.size == 0 or drift.max() <= limit,
+            drift.size == 0 or drift.max() <= LARGEST_DRIFT,
             f"the {name} data do not fit the system's rods and joints: a constraint is off by "
             f"{drift.max() if drift.size else 0:.2g} m^2. Check units, order of the points and lengths.",
         )

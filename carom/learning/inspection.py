@@ -9,6 +9,7 @@ from jaxtyping import Bool
 from carom.checks import require
 from carom.contact.limits import BendLimit, StretchLimit
 from carom.learning.config import LearnConfig
+from carom.learning.data_checks import LARGEST_DRIFT
 from carom.learning.dataset import Chunks, all_gaps, closing, contact_flags
 from carom.learning.refine import IdentifyConfig
 from carom.mechanics.constraints import Rigid
@@ -18,8 +19,7 @@ from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
 
 LOOSE = 1e-3
-"""Constraints that are off by more (m^2) deserve a look; `learn` refuses what is off by `LARGEST`."""
-LARGEST = 5e-2
+"""Constraints that are off by more (m^2) deserve a look; `learn` refuses what is off by `LARGEST_DRIFT`."""
 
 
 class Inspection(NamedTuple):
@@ -50,8 +50,10 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
     closings = closing(recording, system)
     if system.contacts:
         out.append(_depth(recording, system))
-    out += [found for check in (_step_length, _free_fall) if (found := check(recording, system)) is not None]
-    out.append(_chunks(recording, system, config))
+    closed = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
+    more = (_step_length(recording, system), _free_fall(recording, system, closed))
+    out += [finding for finding in more if finding is not None]
+    out.append(_chunks(recording, system, closed, config))
     for k in np.flatnonzero(closings < IdentifyConfig().min_impacts):
         advice = f"too few to tell its friction and restitution: {IdentifyConfig().min_impacts} or more are needed"
         out.append(Finding(f"impacts of property {k}", str(closings[k]), advice))
@@ -62,7 +64,7 @@ def _constraints(recording: Recording, system: System) -> Finding:
     off = np.abs(np.asarray(system.constraints(jnp.asarray(recording.x[recording.valid]))))
     worst = float(off.max(initial=0.0))
     advice = "" if worst <= LOOSE else "lengths of rods, units or the order of points may be wrong"
-    advice += "; `learn` refuses it" if worst > LARGEST else ""
+    advice += "; `learn` refuses it" if worst > LARGEST_DRIFT else ""
     return Finding("rods and joints are off by", f"{worst:.1e} m^2, median {np.median(off):.0e}", advice)
 
 
@@ -94,14 +96,15 @@ def _step_length(recording: Recording, system: System) -> Finding | None:
     return Finding("longest way of a step", f"{longest:.2g} m, {share:.0%} of the smallest contact depth", advice)
 
 
-def _free_fall(recording: Recording, system: System) -> Finding | None:
+def _free_fall(recording: Recording, system: System, closed: Bool[np.ndarray, "N T"]) -> Finding | None:
     """Acceleration of bodies that touch nothing, against the system's uniform field; None where that says nothing."""
     free_bodies = all(isinstance(link, Rigid) for link in system.links)
     if not (free_bodies and isinstance(system.potential, Gravity)):
         return None
     field = np.asarray(system.potential.acceleration)
     size = float(np.linalg.norm(field))
-    flight = _untouched(recording, system)
+    near = closed[:, 2:] | closed[:, 1:-1] | closed[:, :-2]
+    flight = recording.valid[:, 2:] & ~near
     if size == 0 or not flight.any():
         return None
     centers = recording.x[:, :, list(system.table.center)]
@@ -114,17 +117,9 @@ def _free_fall(recording: Recording, system: System) -> Finding | None:
     return Finding("acceleration in free flight", f"{fall:.4g} m/s^2, the system says {size:.4g}", advice)
 
 
-def _untouched(recording: Recording, system: System) -> Bool[np.ndarray, "N inner"]:
-    """Samples (but the first and last) without a closed contact next to them."""
-    closed = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
-    near = closed[:, 2:] | closed[:, 1:-1] | closed[:, :-2]
-    return recording.valid[:, 2:] & ~near
-
-
-def _chunks(recording: Recording, system: System, config: LearnConfig) -> Finding:
+def _chunks(recording: Recording, system: System, closed: Bool[np.ndarray, "N T"], config: LearnConfig) -> Finding:
     """Pieces of trajectories to learn from: those without and with a contact."""
-    flags = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
-    smooth, hit = Chunks.of(flags, recording.length, config.states).count()
+    smooth, hit = Chunks.of(closed, recording.length, config.states).count()
     advice = "" if hit or not system.contacts else "no contact to learn from"
     if smooth + hit == 0:
         longest = int(recording.length.max())

@@ -99,15 +99,8 @@ class RunFolder:
 
     def check_same(self, now: dict[str, Any]) -> None:
         """Raise `CaromError` if a run would go on with other settings than it was started with."""
-        before = self.read_json(CONFIG)
-        free = {"carom_version", "jax_version", "started"}
-        for name in now:
-            new = list(now[name]) if isinstance(now[name], tuple) else now[name]
-            require(
-                name in free or before.get(name) == new,
-                f"the run in {self.path} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same "
-                "options to go on with it, or another --out.",
-            )
+        rest = {name: value for name, value in now.items() if name not in ("carom_version", "jax_version", "started")}
+        check_same_settings(f"the run in {self.path}", self.read_json(CONFIG), rest)
 
     def read_json(self, name: str) -> Any:
         """The content of a JSON file of the run."""
@@ -175,6 +168,17 @@ class RunFolder:
     def close(self) -> None:
         """Finish what is being written."""
         self._checkpoints.close()
+
+
+def check_same_settings(what: str, before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raise `CaromError` if `what` would go on with other settings than it was started with, which JSON has kept."""
+    for name in now:
+        new = list(now[name]) if isinstance(now[name], tuple) else now[name]
+        require(
+            before.get(name) == new,
+            f"{what} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same options to go on with "
+            "it, or another --out.",
+        )
 
 
 def _finite(value: Any) -> Any:
