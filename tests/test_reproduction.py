@@ -11,7 +11,17 @@ from systems import refused
 import carom
 from carom.cli.main import main
 from carom.reproduction.jobs import Job
-from carom.reproduction.results import collect, known, markdown, measured, page, pictures, write, written
+from carom.reproduction.results import (
+    collect,
+    known,
+    markdown,
+    mean_over_seeds,
+    measured,
+    page,
+    pictures,
+    write,
+    written,
+)
 from carom.reproduction.tables import BUILDERS, Cell, paper, table
 from carom.tasks import noisy
 from carom.tasks.pendulums import chain_angles, chain_state
@@ -93,7 +103,7 @@ def test_the_mean_and_its_interval():
     cell = Cell("row", "column", "error", JOB, lambda report: None, paper=4e-3)
     found = measured(cell, [1e-3, 2e-3, 3e-3])
     assert found["carom"] == pytest.approx(2e-3)
-    assert found["ci95"] == pytest.approx(1.96 * 1e-3 / np.sqrt(3))
+    assert found["ci95"] == pytest.approx(4.3027 * 1e-3 / np.sqrt(3), rel=1e-4)  # Student, 2 degrees of freedom
     assert found["ratio"] == pytest.approx(0.5)
     assert found["verdict"] == "met"
 
@@ -112,6 +122,8 @@ def test_what_a_written_table_has_stays(tmp_path):
     assert earlier is not None
     assert list(known(wanted, earlier, 3, quick=False)) == [jobs[0]]
     assert known(wanted, earlier, 3, quick=True) == {}
+    assert "(seed 0 alone)" not in markdown(earlier)
+    assert "(seeds 0, 1)" in markdown(earlier)
     again = collect(wanted, {jobs[2]: report_of(cell, 0.8)}, seeds=3, quick=False, earlier=earlier)
     assert again["cells"][0]["carom"] == pytest.approx(0.65)
     assert list(again["cells"][0]["by_seed"]) == ["0", "2"]
@@ -181,9 +193,11 @@ def test_standard_errors_and_pictures(tmp_path):
     jobs = [job for job in wanted.jobs(2) if job.task in ("cp3", "gyro")]
     content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=2, quick=False)
     (first,) = [c for c in content["over_time"] if (c["row"], c["column"]) == ("CM-CD-CLNN", "cp3")]
-    assert first["state"]["mean"] == [0.0, 0.5]
-    assert first["energy"]["ci95"][1] == pytest.approx(0.25 / np.sqrt(2), rel=1e-3)
+    assert list(mean_over_seeds(first, "state")["mean"]) == [0.0, 0.5]
+    assert mean_over_seeds(first, "energy")["ci95"][1] == pytest.approx(0.25 / np.sqrt(2), rel=1e-3)
     assert len(content["over_time"]) == 14
+    assert content["cells"][28]["early"] == 0.5
+    assert "of carom, first 20 steps" in markdown(content)
     write(content, tmp_path)
     drawn = pictures(tmp_path, tmp_path / "images")
     assert [path.name for path in drawn] == ["errors_over_time.png", "energy_over_time.png"]

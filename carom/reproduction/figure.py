@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from carom.reproduction.results import mean_over_seeds
 from carom.view.style import PALETTE, figure_style, log_axis, new_figure, save_png
 
 LABELS = {"state": "relative error of the state", "energy": "error of the energy / largest kinetic energy"}
@@ -33,7 +34,8 @@ def draw(content: dict[str, Any], quantity: str, path: Path) -> Path:
             log_axis(axes)
             for curve in (c for c in curves if c["column"] == task):
                 k = models.index(curve["row"])
-                mean, half = (np.array(curve[quantity][name], float)[1:] for name in ("mean", "ci95"))
+                found = mean_over_seeds(curve, quantity)
+                mean, half = found["mean"][1:], found["ci95"][1:]
                 time = curve["dt"] * np.arange(1, len(mean) + 1)
                 lost = ~np.isfinite(mean)
                 mean = np.where(lost, np.nan, np.maximum(mean, FLOOR))

@@ -3,10 +3,14 @@
 import dataclasses
 import json
 import platform
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from scipy import stats
 
 from carom.atomic import write_whole
 from carom.checks import require
@@ -18,6 +22,8 @@ from carom.tasks import find_task
 ZERO = 1e-4
 """A printed error of zero is met, and beaten, by one of at most this."""
 TIMES_BETTER = 3.0
+EARLY_STEPS = 20
+"""Length of the trajectories that are learned from: predictions of as many steps are shown beside those of all."""
 PICTURES = {"state": "errors_over_time.png", "energy": "energy_over_time.png"}
 """Files of the pictures of errors over time."""
 
@@ -30,7 +36,7 @@ def deviation(cell: Cell, value: float) -> float:
 
 
 def measured(cell: Cell, values: list[float | None], errors: list[float | None] | None = None) -> dict[str, Any]:
-    """A cell's entry: mean over seeds with its 95 % interval, error, the paper's, and their ratio.
+    """A cell's entry: mean over seeds, half of its 95 % interval (Student's t), error, the paper's, and their ratio.
 
     `verdict`: "better" (by `TIMES_BETTER`), "met", "worse", or "" where there is nothing to compare with; `counted`,
     whether it counts. `errors`: standard errors, by seed, where there are any.
@@ -38,7 +44,9 @@ def measured(cell: Cell, values: list[float | None], errors: list[float | None] 
     found = [float(v) for v in values if v is not None]
     finite = bool(found) and len(found) == len(values) and bool(np.all(np.isfinite(found)))
     mean = float(np.mean(found)) if finite else None
-    spread = float(1.96 * np.std(found, ddof=1) / np.sqrt(len(found))) if finite and len(found) > 1 else None
+    spread = None
+    if finite and len(found) > 1:
+        spread = float(stats.t.ppf(0.975, len(found) - 1) * np.std(found, ddof=1) / np.sqrt(len(found)))
     # The error of a cell is the mean of its seeds' errors: that of their mean would be too kind.
     error = float(np.mean([deviation(cell, v) for v in found])) if finite else None
     paper_error = None if cell.paper is None else deviation(cell, cell.paper)
@@ -90,28 +98,30 @@ def collect(
     """
     kept = {} if earlier is None else known(table, earlier, seeds, quick=quick)
     kept = {job: run for job, run in kept.items() if job not in reports}
-    before = {(cell["row"], cell["column"]): cell.get("by_seed", {}) for cell in (earlier or {}).get("cells", [])}
+    before = _written_by_place(earlier, "cells")
     cells = []
     for cell in table.cells:
-        if cell.job is None:
-            cells.append(measured(cell, []))
-            continue
-        found = {}
-        for seed in range(seeds):
-            job = dataclasses.replace(cell.job, seed=seed)
-            if job in reports:
-                found[str(seed)] = _entry(cell, reports[job])
-            elif job in kept and str(seed) in (old := before.get((cell.row, cell.column), {})):
-                found[str(seed)] = old[str(seed)]
+        found = _by_seed(cell, lambda report, cell=cell: _entry(cell, report), reports, kept, before, seeds)
         if found:
             entry = measured(cell, _column(found, "value"), _column(found, "standard_error"))
             bounded = [value for value in _column(found, "bounded") if value is not None]
             if entry["carom"] is None and bounded:
                 entry["bounded"] = float(np.mean(bounded))
             cells.append({**entry, "by_seed": found})
+        elif cell.job is None:
+            cells.append(measured(cell, []))
         else:
             cells.append({**measured(dataclasses.replace(cell, job=None), []), "note": "not run yet"})
-    curves = _curves(table, reports, earlier) if table.over_time else []
+    curves = []
+    if table.over_time:
+        before = _written_by_place(earlier, "over_time")
+        for cell, entry in zip(table.cells, cells, strict=True):
+            found = _by_seed(cell, lambda report, cell=cell: _curves(cell, report), reports, kept, before, seeds)
+            if cell.job is not None and found:
+                dt = find_task(cell.job.task).dt
+                curves.append({"row": cell.row, "column": cell.column, "dt": dt, "by_seed": found})
+                early = np.array(mean_over_seeds(curves[-1], "state")["mean"][1 : EARLY_STEPS + 1], float)
+                entry["early"] = float(f"{early.mean():.4g}") if np.all(np.isfinite(early)) else None
     return {
         "table": table.name,
         "title": table.title,
@@ -138,6 +148,32 @@ def known(table: Table, earlier: dict[str, Any], seeds: int, *, quick: bool) -> 
     }
 
 
+def _written_by_place(earlier: dict[str, Any] | None, what: str) -> dict[tuple[str, str], dict[str, Any]]:
+    """What a written table has by seed, by row and column."""
+    return {(entry["row"], entry["column"]): entry.get("by_seed", {}) for entry in (earlier or {}).get(what, [])}
+
+
+def _by_seed(
+    cell: Cell,
+    read: Callable[[dict[str, Any]], dict[str, Any]],
+    reports: dict[Job, dict[str, Any]],
+    kept: dict[Job, dict[str, Any]],
+    before: dict[tuple[str, str], dict[str, Any]],
+    seeds: int,
+) -> dict[str, dict[str, Any]]:
+    """What each seed's training says of a cell: by its report, else as it was written before."""
+    if cell.job is None:
+        return {}
+    old, found = before.get((cell.row, cell.column), {}), {}
+    for seed in range(seeds):
+        job = dataclasses.replace(cell.job, seed=seed)
+        if job in reports:
+            found[str(seed)] = read(reports[job])
+        elif job in kept and str(seed) in old:
+            found[str(seed)] = old[str(seed)]
+    return found
+
+
 def _entry(cell: Cell, report: dict[str, Any]) -> dict[str, float | None]:
     """What one training says of a cell; None for a number that is not finite."""
     readers = {"value": cell.read, "standard_error": cell.read_error, "bounded": cell.read_bounded}
@@ -149,37 +185,23 @@ def _column(by_seed: dict[str, dict[str, float | None]], name: str) -> list[floa
     return [entry.get(name) for entry in by_seed.values()]
 
 
-def _curves(table: Table, reports: dict[Job, dict[str, Any]], earlier: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """Errors over time of a table's trainings: of those with a report, else as they were written before."""
-    before = {(curve["row"], curve["column"]): curve for curve in (earlier or {}).get("over_time", [])}
-    curves = []
-    for cell in table.cells:
-        place = (cell.row, cell.column)
-        if cell.job is not None and any(_of(cell.job, job) for job in reports):
-            curves.append({"row": cell.row, "column": cell.column, **_mean_over_seeds(cell.job, reports)})
-        elif place in before:
-            curves.append(before[place])
-    return curves
+def _curves(cell: Cell, report: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
+    """Errors over time that one training has, by quantity: means, halves of 95 % intervals, medians."""
+    assert cell.job is not None
+    found = report["over_time"][cell.job.data]
+    return {
+        quantity: {name: [float(f"{v:.3g}") for v in values] for name, values in found[quantity].items()}
+        for quantity in PICTURES
+    }
 
 
-def _of(job: Job, other: Job) -> bool:
-    """Whether they differ in their seeds alone."""
-    return dataclasses.replace(job, seed=other.seed) == other
-
-
-def _mean_over_seeds(job: Job, reports: dict[Job, dict[str, Any]]) -> dict[str, Any]:
-    """Errors over time of all seeds of a job together: of the same number of trajectories each."""
-    seeds = [report["over_time"][job.data] for other, report in reports.items() if _of(job, other)]
-    out: dict[str, Any] = {"dt": find_task(job.task).dt}
-    for quantity in ("state", "energy"):
-        mean, half, median = (
-            np.array([seed[quantity][k] for seed in seeds], float) for k in ("mean", "ci95", "median")
-        )
-        # Independent test sets: the variance of their mean.
-        spread = np.sqrt(np.sum(half**2, axis=0)) / len(seeds)
-        named = {"mean": mean.mean(axis=0), "ci95": spread, "median": median.mean(axis=0)}
-        out[quantity] = {name: [float(f"{v:.4g}") for v in values] for name, values in named.items()}
-    return out
+def mean_over_seeds(curve: dict[str, Any], quantity: str) -> dict[str, Float[np.ndarray, " T"]]:
+    """Errors over time of all seeds of a cell together, which have as many trajectories each."""
+    seeds = [seed[quantity] for seed in curve["by_seed"].values()]
+    mean, half, median = (np.array([seed[name] for seed in seeds], float) for name in ("mean", "ci95", "median"))
+    # Independent test sets: the variance of their mean.
+    spread = np.sqrt(np.sum(half**2, axis=0)) / len(seeds)
+    return {"mean": mean.mean(axis=0), "ci95": spread, "median": median.mean(axis=0)}
 
 
 def summary(cells: list[dict[str, Any]]) -> dict[str, int]:
@@ -214,7 +236,9 @@ def write(content: dict[str, Any], folder: Path) -> Path:
     """Write `TABLE.json` and `TABLE.md` into the folder; returns the former's path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{content['table']}.json"
-    write_whole(path, (json.dumps(content, indent=1) + "\n").encode())
+    text = json.dumps(content, indent=1)
+    lists_on_a_line = re.sub(r"\[[^][{}\"]*\]", lambda found: " ".join(found[0].split()), text)
+    write_whole(path, (lists_on_a_line + "\n").encode())
     write_whole(path.with_suffix(".md"), markdown(content).encode())
     return path
 
@@ -223,6 +247,11 @@ def _number(value: float | None) -> str:
     if value is None:
         return ""
     return f"{value:.2e}" if value and abs(value) < 1e-3 else f"{value:.5g}"
+
+
+def _with_interval(cell: dict[str, Any]) -> str:
+    number = _number(cell["carom"]) or _without_number(cell)
+    return number if cell["ci95"] is None else f"{number} ± {cell['ci95']:.0e}"
 
 
 def _without_number(cell: dict[str, Any]) -> str:
@@ -235,29 +264,25 @@ def markdown(content: dict[str, Any]) -> str:
     lines = [f"## {content['title']}", ""]
     if content["quick"]:
         lines += ["A smoke run (`--quick`): the numbers mean nothing.", ""]
-    head = ["row", "column", "true", "paper", "carom", "error of the paper", "error of carom", "ratio", ""]
-    told = any("standard_error" in cell for cell in content["cells"])
-    if told:
-        head.insert(5, "standard error")
-    lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for cell in content["cells"]:
-        carom = _number(cell["carom"])
-        if cell["ci95"] is not None:
-            carom += f" ± {cell['ci95']:.0e}"
-        row = [
-            cell["row"],
-            cell["column"],
-            _number(cell["true"]),
-            _number(cell["paper"]),
-            carom or _without_number(cell),
-            _number(cell["paper_error"]),
-            _number(cell["error"]),
-            _number(cell["ratio"]),
-            cell["verdict"] if cell.get("counted", True) or not cell["verdict"] else f"({cell['verdict']})",
-        ]
-        if told:
-            row.insert(5, _number(cell.get("standard_error")))
-        lines.append("| " + " | ".join(row) + " |")
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "row": lambda cell: cell["row"],
+        "column": lambda cell: cell["column"],
+        "true": lambda cell: _number(cell["true"]),
+        "paper": lambda cell: _number(cell["paper"]),
+        "carom": _with_interval,
+        "standard error": lambda cell: _number(cell.get("standard_error")),
+        "error of the paper": lambda cell: _number(cell["paper_error"]),
+        "error of carom": lambda cell: _number(cell["error"]),
+        f"of carom, first {EARLY_STEPS} steps": lambda cell: _number(cell.get("early")),
+        "ratio": lambda cell: _number(cell["ratio"]),
+        "": lambda cell: (
+            cell["verdict"] if cell.get("counted", True) or not cell["verdict"] else f"({cell['verdict']})"
+        ),
+    }
+    rows = [{name: show(cell) for name, show in columns.items()} for cell in content["cells"]]
+    shown = [name for name in columns if any(row[name] for row in rows)]
+    lines += ["| " + " | ".join(shown) + " |", "|" + "---|" * len(shown)]
+    lines += ["| " + " | ".join(row[name] for name in shown) + " |" for row in rows]
     counts = content["summary"]
     if counts["compared"]:
         lines += [
@@ -271,10 +296,11 @@ def markdown(content: dict[str, Any]) -> str:
         lines += [""] + [f"![{name.removesuffix('.png')}](images/{name})" for name in PICTURES.values()]
     if content["runs"]:
         commits = sorted({run["commit"] for run in content["runs"].values() if run.get("commit")})
+        count = len(content["runs"])
         seconds = sum(run["seconds"] for run in content["runs"].values())
         lines += [
             "",
-            f"{len(content['runs'])} trainings ({_seeds(content)}), {seconds / 60:.0f} minutes together; "
+            f"{count} training{'s' * (count != 1)} ({_seeds(content)}), {seconds / 60:.0f} minutes together; "
             f"{content['machine']}"
             + (f"; commit {', '.join(commits)}" if commits else "")
             + f". `carom reproduce {content['table']}`.",
@@ -283,9 +309,15 @@ def markdown(content: dict[str, Any]) -> str:
 
 
 def _seeds(content: dict[str, Any]) -> str:
-    """Which seeds a table is of."""
-    found = sorted({int(seed) for cell in content["cells"] for seed in cell.get("by_seed", {})})
-    return "seed 0 alone" if found == [0] else f"seeds {', '.join(map(str, found))}"
+    """Which seeds a table is of, and how many of its cells have fewer."""
+    cells = [set(cell["by_seed"]) for cell in content["cells"] if "by_seed" in cell]
+    every = set().union(*cells)
+    if every == {"0"}:
+        return "seed 0 alone"
+    fewer = sum(seeds != every for seeds in cells)
+    return f"seeds {', '.join(sorted(every, key=int))}" + (
+        f"; {fewer} of {len(cells)} cells have fewer" if fewer else ""
+    )
 
 
 def _worse(content: dict[str, Any]) -> list[str]:
@@ -309,8 +341,8 @@ def page(folder: Path) -> str:
         "Made by `carom reproduce`; numbers, seeds, times and settings are in `results/`. A property's error is its "
         "distance to the true value (relative for mass ratios above one), that of a trajectory `|z - z^| / |z|` over "
         "positions and velocities together, mean over time and 100 test trajectories, whose states have their own "
-        "seed. The mean is over seeds, after ± half of its 95 % interval. A printed error of zero is met by one of at "
-        f"most {ZERO:g}. Paper: Zhong, Dey, Chakraborty, NeurIPS 2021, supplement.",
+        "seed. The mean is over seeds, after ± half of its 95 % interval (Student's t). A printed error of zero is "
+        f"met by one of at most {ZERO:g}. Paper: Zhong, Dey, Chakraborty, NeurIPS 2021, supplement.",
         "",
     ]
     total = {"compared": 0, "met": 0, "better": 0}
