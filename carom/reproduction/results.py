@@ -1,6 +1,7 @@
 """From finished trainings to a table: `results/TABLE.json`, `results/TABLE.md`, and the page of all of them."""
 
 import dataclasses
+import functools
 import json
 import platform
 import re
@@ -16,14 +17,12 @@ from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
 from carom.reproduction.jobs import Job
-from carom.reproduction.tables import BUILDERS, Cell, Table
+from carom.reproduction.tables import BUILDERS, EARLY_STEPS, Cell, Table
 from carom.tasks import find_task
 
 ZERO = 1e-4
 """A printed error of zero is met, and beaten, by one of at most this."""
 TIMES_BETTER = 3.0
-EARLY_STEPS = 20
-"""Length of the trajectories that are learned from: predictions of as many steps are shown beside those of all."""
 PICTURES = {"state": "errors_over_time.png", "energy": "energy_over_time.png"}
 """Files of the pictures of errors over time."""
 
@@ -66,9 +65,9 @@ def measured(cell: Cell, values: list[float | None], errors: list[float | None] 
         "note": cell.note,
         "counted": cell.counted,
     }
-    known = [e for e in errors or [] if e is not None]
-    if known:
-        out["standard_error"] = float(np.mean(known))
+    standard_error = _mean_where_known(errors or [])
+    if standard_error is not None:
+        out["standard_error"] = standard_error
     if cell.job is None or paper_error is None:
         return out
     if error is None:
@@ -101,13 +100,12 @@ def collect(
     before = _written_by_place(earlier, "cells")
     cells = []
     for cell in table.cells:
-        found = _by_seed(cell, lambda report, cell=cell: _entry(cell, report), reports, kept, before, seeds)
+        found = _by_seed(cell, functools.partial(_entry, cell), reports, kept, before, seeds)
         if found:
             entry = measured(cell, _column(found, "value"), _column(found, "standard_error"))
-            bounded = [value for value in _column(found, "bounded") if value is not None]
-            if entry["carom"] is None and bounded:
-                entry["bounded"] = float(np.mean(bounded))
-            cells.append({**entry, "by_seed": found})
+            other = ["early"] if entry["carom"] is not None else ["early", "bounded"]
+            means = {name: _mean_where_known(_column(found, name)) for name in other}
+            cells.append({**entry, **{k: v for k, v in means.items() if v is not None}, "by_seed": found})
         elif cell.job is None:
             cells.append(measured(cell, []))
         else:
@@ -115,13 +113,11 @@ def collect(
     curves = []
     if table.over_time:
         before = _written_by_place(earlier, "over_time")
-        for cell, entry in zip(table.cells, cells, strict=True):
-            found = _by_seed(cell, lambda report, cell=cell: _curves(cell, report), reports, kept, before, seeds)
+        for cell in table.cells:
+            found = _by_seed(cell, functools.partial(_curves, cell), reports, kept, before, seeds)
             if cell.job is not None and found:
                 dt = find_task(cell.job.task).dt
                 curves.append({"row": cell.row, "column": cell.column, "dt": dt, "by_seed": found})
-                early = np.array(mean_over_seeds(curves[-1], "state")["mean"][1 : EARLY_STEPS + 1], float)
-                entry["early"] = float(f"{early.mean():.4g}") if np.all(np.isfinite(early)) else None
     return {
         "table": table.name,
         "title": table.title,
@@ -176,13 +172,23 @@ def _by_seed(
 
 def _entry(cell: Cell, report: dict[str, Any]) -> dict[str, float | None]:
     """What one training says of a cell; None for a number that is not finite."""
-    readers = {"value": cell.read, "standard_error": cell.read_error, "bounded": cell.read_bounded}
+    readers = {
+        "value": cell.read,
+        "standard_error": cell.read_error,
+        "bounded": cell.read_bounded,
+        "early": cell.read_early,
+    }
     found = {name: read(report) for name, read in readers.items() if read is not None}
     return {name: None if value is None or not np.isfinite(value) else float(value) for name, value in found.items()}
 
 
 def _column(by_seed: dict[str, dict[str, float | None]], name: str) -> list[float | None]:
     return [entry.get(name) for entry in by_seed.values()]
+
+
+def _mean_where_known(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _curves(cell: Cell, report: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
