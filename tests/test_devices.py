@@ -25,7 +25,7 @@ from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset
 from carom.learning.devices import is_first, start_processes
 from carom.learning.run import CONFIG, RunFolder
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 
 folder, epochs, resume = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "resume"
 if len(sys.argv) > 4:

@@ -14,8 +14,8 @@ from carom.learning.identify import identify
 from carom.learning.parameters import at_bounds, moved, physical_vector
 from carom.learning.shooting import Shooting, choose_windows, estimate, is_noisy, shoot, step_errors, window_directions
 from carom.learning.train import initial_unknowns
-from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
+from carom.simulation.recording import Recording
 
 DT, STEPS, NOISE = 0.01, 60, 0.03
 FRICTION, RESTITUTION = 0.2, 0.7

@@ -12,7 +12,8 @@ from carom.cli.tables import findings_table, told_table
 from carom.errors import CaromError
 from carom.learning.identify import MOST_POINTS, identify
 from carom.learning.inspection import inspect_recording
-from carom.simulation.files import Recording, load_recording
+from carom.simulation.files import load_recording
+from carom.simulation.recording import Recording
 from carom.simulation.recording_checks import check_recording
 from carom.system import System
 

@@ -30,7 +30,8 @@ from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.learning.tosses import TossConfig, can_learn_tosses
 from carom.learning.train import LearnReport, learn, quantities
-from carom.simulation.files import Recording, load_recording, save_recording
+from carom.simulation.files import load_recording, save_recording
+from carom.simulation.recording import Recording
 from carom.tasks import make_data_sets, noisy
 
 QUICK = {"trajectories": 100, "epochs": 20}

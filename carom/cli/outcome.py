@@ -14,7 +14,7 @@ from carom.learning.evaluate import state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.run import TRUTH, RunFolder
 from carom.learning.train import quantities
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 

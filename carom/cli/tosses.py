@@ -25,7 +25,7 @@ from carom.learning.protocols import (
 )
 from carom.learning.run import MODEL, REPORT, RunFolder
 from carom.learning.tosses import CENTER, TossConfig, TossReport, learn_tosses, predict_tosses
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.system import System
 
 PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": 8.1e-4, **dict.fromkeys(CENTER, 0.0)}

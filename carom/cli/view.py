@@ -20,8 +20,9 @@ from carom.learning.dataset import trajectory_of
 from carom.learning.evaluate import predict
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
-from carom.simulation.files import Recording, load_recording
+from carom.simulation.files import load_recording
 from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 

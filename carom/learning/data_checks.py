@@ -6,7 +6,7 @@ import numpy as np
 from carom.checks import require
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset, closed_contacts
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.system import System
 
 LARGEST_DRIFT = 5e-2

@@ -10,8 +10,8 @@ from carom.checks import require
 from carom.learning.baselines import physical_quantities
 from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
-from carom.simulation.files import Recording
 from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.recording import Recording
 from carom.simulation.rollout import Trajectory, simulate
 from carom.system import System
 

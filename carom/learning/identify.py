@@ -48,8 +48,8 @@ from carom.learning.refine import (
 from carom.learning.sensitivity import StepSensitivity
 from carom.learning.shooting import shoot, shooting_of
 from carom.mechanics.dynamics import Formulation
-from carom.simulation.files import Recording
 from carom.simulation.impact import COMPENSATION_STEPS, Stepper
+from carom.simulation.recording import Recording
 from carom.system import System
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified"]

@@ -14,7 +14,7 @@ from carom.learning.dataset import Chunks, all_gaps, closing, contact_flags
 from carom.learning.refine import IdentifyConfig
 from carom.mechanics.constraints import Rigid
 from carom.mechanics.potentials import Gravity
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
 

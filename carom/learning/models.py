@@ -13,7 +13,7 @@ from carom.contact.impulses import ContactModel
 from carom.contact.limits import StretchLimit
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Potential
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.system import StepModel, System
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from carom.checks import require
 from carom.contact.boxes import CornerPlane
 from carom.mechanics.bodies import recover_pose
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.system import System
 
 Protocol = Literal["A", "B"]

@@ -21,8 +21,8 @@ from carom.learning.parameters import at_bounds, bounds, linear_weights, moved, 
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.sensitivity import StepSensitivity, force_features, step_sensitivity
 from carom.mechanics.dynamics import saddle_point
-from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
+from carom.simulation.recording import Recording
 from carom.system import System
 
 MOST_POINTS = 40

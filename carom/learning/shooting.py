@@ -26,9 +26,9 @@ from carom.learning.models import Unknowns
 from carom.learning.parameters import at_bounds, bounds, linear_weights, moved, physical, physical_vector, ridge
 from carom.learning.refine import MOST_CHANGE, IdentifyConfig, error_sizes, principal_directions
 from carom.learning.robust import CUTOFF, newton_step
-from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
 from carom.simulation.projection import project_state
+from carom.simulation.recording import Recording
 from carom.simulation.rollout import step
 from carom.system import System
 

@@ -31,8 +31,8 @@ from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.run import RunFolder
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Gravity
-from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
+from carom.simulation.recording import Recording
 from carom.simulation.rollout import rollout
 from carom.system import System
 

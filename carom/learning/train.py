@@ -27,8 +27,8 @@ from carom.learning.progress import LoopProgress, training_text
 from carom.learning.refine import Fit, can_be_refined, polish
 from carom.learning.run import RunFolder
 from carom.learning.shooting import Shot, estimate
-from carom.simulation.files import Recording
 from carom.simulation.impact import Stepper
+from carom.simulation.recording import Recording
 from carom.system import StepModel, System
 
 

@@ -22,7 +22,7 @@ from carom.learning.model_file import save_model
 from carom.learning.refine import MOST_POINTS
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
 from carom.learning.train import learn
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 from carom.system import System
 from carom.tasks import make_data_sets, noisy, task
 

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from carom.checks import require
 from carom.errors import CaromError
 from carom.mechanics.bodies import embed_pose, embed_velocity, recover_pose
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 
 NAMES = {
     "position": ("position", "pos"),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from carom.simulation.files import Recording
+from carom.simulation.recording import Recording
 
 
 class Finding(NamedTuple):

@@ -1,0 +1,255 @@
+"""What is recorded of a system's motion, checked: `Recording`, which trajectory files hold (`files.py`)."""
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from carom.errors import CaromError
+
+STEP_TOLERANCE = 1e-6
+"""Largest difference of two time steps that count as equal, relative to the step."""
+
+STATE_AXES = ("trajectory", "time", "point", "axis")
+
+
+class Recording(eqx.Module):
+    """Recorded motion of one system: what a trajectory file holds. Make one with `Recording.of`.
+
+    `x`, `v` are positions and velocities in m and m/s; `contact` says whether the step that ends at
+    a sample had an active contact, None where that was not recorded; `time` in s; `length` is the
+    number of valid samples of each trajectory, beyond which is padding of any value; `group` its
+    session, None where each stands alone (trajectories of one session are alike); `dt` the time
+    step in s; `task` the task's name or "", `source` where the data come from, `carom_version` what
+    wrote the file.
+    """
+
+    x: Float64[np.ndarray, "N T n d"]
+    v: Float64[np.ndarray, "N T n d"]
+    contact: Bool[np.ndarray, "N T"] | None
+    time: Float64[np.ndarray, " T"]
+    length: Int64[np.ndarray, " N"]
+    group: Int64[np.ndarray, " N"] | None
+    dt: float = eqx.field(static=True)
+    units: str = eqx.field(static=True)
+    task: str = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+    carom_version: str = eqx.field(static=True)
+
+    @property
+    def valid(self) -> Bool[np.ndarray, "N T"]:
+        """Which samples are not padding."""
+        return np.arange(self.x.shape[1]) < self.length[:, None]
+
+    @classmethod
+    def of(
+        cls,
+        x: Any,
+        v: Any,
+        *,
+        time: Any = None,
+        dt: Any = None,
+        contact: Any = None,
+        length: Any = None,
+        group: Any = None,
+        units: str = "SI",
+        task: str = "",
+        source: str = "",
+        carom_version: str = "",
+    ) -> "Recording":
+        """Check arrays, of whatever kind NumPy takes, and put them together.
+
+        Numbers become double precision; single precision and integers are converted. Of `time` and
+        `dt` one is enough. `time` may have a row for each trajectory: if these start at different
+        times, the recording counts each from its own start. `length` is the full one by default.
+
+        Raises:
+            CaromError: naming the argument, what it was, and what to do.
+        """
+        x, v = _states("x", x), _states("v", v)
+        require_part(v.shape == x.shape, "v", f"have the shape of x, {x.shape}", v.shape)
+        length = _lengths(length, x.shape)
+        valid = np.arange(x.shape[1]) < length[:, None]
+        _check_finite("x", x, valid, STATE_AXES)
+        _check_finite("v", v, valid, STATE_AXES)
+        time, dt = _clock(time, dt, valid)
+        contact = None if contact is None else _flags(contact, x.shape)
+        group = None if group is None else _groups(group, x.shape[0])
+        texts = {"units": units, "task": task, "source": source, "carom_version": carom_version}
+        texts = {name: plain_text(name, text) for name, text in texts.items()}
+        return cls(x=x, v=v, contact=contact, time=time, length=length, group=group, dt=dt, **texts)
+
+    @property
+    def n_trajectories(self) -> int:
+        return self.x.shape[0]
+
+    @property
+    def n_points(self) -> int:
+        return self.x.shape[2]
+
+    @property
+    def dim(self) -> int:
+        return self.x.shape[3]
+
+    def select(self, indices: Any) -> "Recording":
+        """The trajectories with these indices, or where a mask is true, in this order."""
+        rows = np.arange(self.n_trajectories)[indices].reshape(-1)
+        contact, group = (None if part is None else part[rows] for part in (self.contact, self.group))
+        return replace(self, x=self.x[rows], v=self.v[rows], contact=contact, length=self.length[rows], group=group)
+
+
+def require_part(good: bool, name: str, wanted: str, was: Any, advice: str = "correct it") -> None:
+    """Raise `CaromError` unless a part of a recording is good: what it must do, what it was, what to do."""
+    if not good:
+        raise CaromError(f"{name} must {wanted}; it was {brief(was)}; {advice}.")
+
+
+def brief(value: Any) -> str:
+    """`value` on one line, shortened."""
+    line = " ".join(str(value).split()) or "empty"
+    return line if len(line) <= 200 else f"{line[:200]}..."
+
+
+def _numbers(name: str, value: Any, axes: tuple[str, ...]) -> np.ndarray:
+    array = np.asarray(value)
+    wanted = "hold floating-point numbers or integers"
+    require_part(array.dtype.kind in "fiu", name, wanted, array.dtype, "convert it to float64")
+    wanted = f"have the axes ({', '.join(axes)})"
+    require_part(array.ndim == len(axes), name, wanted, f"of shape {array.shape}", "reshape it")
+    return array
+
+
+def _doubles(array: np.ndarray) -> Float64[np.ndarray, "..."]:
+    with np.errstate(over="ignore"):  # becomes infinite, which is reported with its place
+        return np.asarray(array, dtype=np.float64, order="C")
+
+
+def _states(name: str, value: Any) -> Float64[np.ndarray, "N T n d"]:
+    array = _numbers(name, value, STATE_AXES)
+    n, samples, points, dim = array.shape
+    was = f"of shape {array.shape}"
+    require_part(dim in (2, 3), name, "have a last axis of 2 or 3, those of space", was, "reshape it")
+    require_part(min(n, points) >= 1, name, "have at least 1 trajectory and 1 point", was)
+    require_part(samples >= 2, name, "have at least 2 samples in time", was, "record more")
+    return _doubles(array)
+
+
+def _lengths(value: Any, shape: tuple[int, ...]) -> Int64[np.ndarray, " N"]:
+    n, samples = shape[:2]
+    array = np.full(n, samples) if value is None else np.asarray(value)
+    was = f"{array.dtype} of shape {array.shape}"
+    good = array.dtype.kind in "iu" and array.shape == (n,)
+    require_part(good, "length", f"be {n} integers, one a trajectory", was, "count the valid samples")
+    bad = (array < 2) | (array > samples)
+    was = f"{array.flat[np.argmax(bad)]} at {_place(bad, STATE_AXES[:1])}"
+    require_part(not bad.any(), "length", f"be from 2 to {samples}, the number of samples", was)
+    return array.astype(np.int64)
+
+
+def _flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
+    array = np.asarray(value)
+    wanted = f"have the shape {shape[:2]}, a flag for each sample of x"
+    require_part(array.shape == shape[:2], "contact", wanted, array.shape, "correct or remove it")
+    kind = array.dtype.kind
+    good = kind == "b" or (kind in "iu" and bool(np.isin(array, (0, 1)).all()))
+    wanted = "hold true and false, or 0 and 1"
+    require_part(good, "contact", wanted, array.dtype, "convert it to bool or remove it")
+    return array.astype(bool)
+
+
+def _groups(value: Any, count: int) -> Int64[np.ndarray, " N"]:
+    array = np.asarray(value)
+    good = array.dtype.kind in "iu" and array.shape == (count,)
+    was = f"{array.dtype} of shape {array.shape}"
+    require_part(good, "group", f"be {count} integers, one a trajectory", was, "number the sessions, or remove it")
+    return array.astype(np.int64)
+
+
+def plain_text(name: str, value: Any) -> str:
+    """A text, from what either format makes of it."""
+    text = value
+    if not isinstance(value, str | bytes):
+        text = np.asarray(value).item() if np.size(value) == 1 else None
+    if isinstance(text, bytes):
+        text = text.decode("utf-8", errors="surrogateescape")
+    # No format holds a null character, and a lone surrogate stands for bytes that are no text.
+    if not isinstance(text, str) or any(c == "\0" or "\ud800" <= c <= "\udfff" for c in text):
+        raise CaromError(f"{name} must be a plain text; it was {brief(repr(value))}; correct it.")
+    return text
+
+
+def _check_finite(name: str, array: np.ndarray, valid: np.ndarray, axes: tuple[str, ...]) -> None:
+    if np.isfinite(array).all():
+        return
+    bad = ~np.isfinite(array) & valid.reshape(valid.shape + (1,) * (array.ndim - valid.ndim))
+    was = f"NaN or infinite in {bad.sum()} places, the first at {_place(bad, axes)}"
+    advice = "repair or leave out these trajectories, or set length to end them before"
+    require_part(not bad.any(), name, "be finite", was, advice)
+
+
+def _place(bad: np.ndarray, axes: tuple[str, ...]) -> str:
+    first = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    return ", ".join(f"{axis} {int(i)}" for axis, i in zip(axes, first, strict=True))
+
+
+def time_step(value: Any) -> float:
+    """A time step (s), from what any format makes of it."""
+    array = np.asarray(value)
+    number = float(array.item()) if array.size == 1 and array.dtype.kind in "fiu" else np.nan
+    advice = "give the time step in seconds"
+    require_part(0 < number < np.inf, "dt", "be one positive number", repr(array.tolist()), advice)
+    return number
+
+
+def _clock(time: Any, dt: Any, valid: np.ndarray) -> tuple[Float64[np.ndarray, " T"], float]:
+    """The times of the samples and the step between them, from either or both."""
+    n, samples = valid.shape
+    dt = None if dt is None else time_step(dt)
+    if time is None:
+        if dt is None:
+            raise CaromError("dt and time are both missing; give dt, the time step in seconds.")
+        return dt * np.arange(samples), dt
+
+    axes = STATE_AXES[:2] if np.ndim(time) == 2 else STATE_AXES[1:2]
+    raw = _numbers("time", time, axes)
+    shape = (n, samples)[-raw.ndim :]
+    require_part(raw.shape == shape, "time", f"have the shape {shape}, as x", raw.shape)
+    longest = int(np.argmax(valid.sum(axis=1)))
+    inside = valid[longest]
+    valid = valid if raw.ndim == 2 else inside
+    array = _doubles(raw)
+    _check_finite("time", array, valid, axes)
+    array = np.where(valid, array, 0.0)
+    # A time was rounded to the digits it was stored with: half a unit at either end of a step, and
+    # as much again where times were added up.
+    last = np.max(np.abs(array)).astype(raw.dtype)
+    rounding = 2 * float(np.spacing(last)) if raw.dtype.kind == "f" else 0.0
+    _check_steps(array, valid, rounding, axes)
+
+    row = (array[longest] if raw.ndim == 2 else array)[inside]
+    with np.errstate(over="ignore"):
+        step = time_step((row[-1] - row[0]) / (len(row) - 1))
+    good = dt is None or abs(dt - step) <= STEP_TOLERANCE * step + rounding
+    require_part(good, "dt", f"be the step of time, {step:.9g} s", dt, "correct whichever is wrong")
+    dt = step if dt is None else dt
+    if (array[..., 0] != row[0]).any():
+        row = row - row[0]
+    beyond = row[0] + dt * np.arange(len(row), samples)
+    return np.concatenate([row, beyond]), dt
+
+
+def _check_steps(time: np.ndarray, valid: np.ndarray, rounding: float, axes: tuple[str, ...]) -> None:
+    valid = valid[..., 1:]
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported as unequal
+        steps = np.diff(time, axis=-1)
+        typical = float(np.median(steps[valid]))
+        back = ~(steps > 0) & valid
+        uneven = ~(np.abs(steps - typical) <= STEP_TOLERANCE * typical + rounding) & valid
+    for bad, wanted in ((back, "increase"), (uneven, "have equal steps")):
+        if bad.any():
+            raise CaromError(
+                f"time must {wanted}; the step after {_place(bad, axes)} was {steps[bad][0]:.9g} s, "
+                f"most were {typical:.9g} s; resample to one step, or split the data there."
+            )
