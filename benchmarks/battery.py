@@ -19,7 +19,7 @@ from rich.table import Table
 
 import carom
 from carom.contact.cones import solve_cone_problem
-from carom.contact.impulses import two_phases
+from carom.contact.phases import two_phases
 from tests.cone_problems import (
     FAMILIES,
     TINY,

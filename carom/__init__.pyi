@@ -14,10 +14,10 @@ from .contact.impulses import ContactModel as ContactModel
 from .contact.impulses import ContactState as ContactState
 from .contact.impulses import Coulomb as Coulomb
 from .contact.impulses import Jump as Jump
-from .contact.impulses import contact_impulse as contact_impulse
-from .contact.impulses import solve_impulse as solve_impulse
 from .contact.limits import BendLimit as BendLimit
 from .contact.limits import StretchLimit as StretchLimit
+from .contact.phases import contact_impulse as contact_impulse
+from .contact.phases import solve_impulse as solve_impulse
 from .errors import CaromError as CaromError
 from .learning.config import LearnConfig as LearnConfig
 from .learning.dataset import Dataset as Dataset
@@ -52,7 +52,6 @@ from .mechanics.potentials import NoPotential as NoPotential
 from .mechanics.potentials import Potential as Potential
 from .mechanics.potentials import Springs as Springs
 from .mechanics.potentials import Sum as Sum
-from .simulation.files import Recording as Recording
 from .simulation.files import load_recording as load_recording
 from .simulation.files import save_recording as save_recording
 from .simulation.integrators import RK4 as RK4
@@ -60,6 +59,7 @@ from .simulation.mujoco_files import MujocoModel as MujocoModel
 from .simulation.mujoco_files import load_mujoco as load_mujoco
 from .simulation.poses import PoseRecording as PoseRecording
 from .simulation.poses import load_poses as load_poses
+from .simulation.recording import Recording as Recording
 from .simulation.rollout import Trajectory as Trajectory
 from .simulation.rollout import simulate as simulate
 from .system import System as System

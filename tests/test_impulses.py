@@ -7,7 +7,8 @@ import pytest
 from systems import refused
 
 import carom
-from carom.contact.impulses import consistent_velocity, target_velocity, two_phases
+from carom.contact.impulses import consistent_velocity, target_velocity
+from carom.contact.phases import two_phases
 
 
 @pytest.mark.parametrize("task", ["bp5-e", "cp3", "gyro-e", "rope"])

@@ -15,16 +15,8 @@ import carom
 from carom.cli.main import main
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
-from carom.learning.tosses import (
-    CENTER,
-    TossConfig,
-    choose_segments,
-    learn_tosses,
-    predict_tosses,
-    prepared,
-    read_values,
-    with_values,
-)
+from carom.learning.toss_parameters import CENTER, read_values, with_values
+from carom.learning.tosses import TossConfig, choose_segments, learn_tosses, predict_tosses, prepared
 from carom.mechanics.bodies import embed_pose, embed_velocity
 from carom.simulation.poses import poses_of
 

@@ -24,7 +24,8 @@ from carom.learning.protocols import (
     toss_errors,
 )
 from carom.learning.run import MODEL, REPORT, RunFolder
-from carom.learning.tosses import CENTER, TossConfig, TossReport, learn_tosses, predict_tosses
+from carom.learning.toss_parameters import CENTER
+from carom.learning.tosses import TossConfig, TossReport, learn_tosses, predict_tosses
 from carom.simulation.recording import Recording
 from carom.system import System
 

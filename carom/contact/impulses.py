@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from carom.checks import as_floats, is_known, require, require_values
+from carom.checks import as_floats, require, require_values
 from carom.contact.candidates import Active
-from carom.contact.cones import ConeSettings, ConeSolution, solve_cone_problem
 from carom.contact.lcp import solve_lcp_impulse
+from carom.contact.phases import two_phases
 
 
 class ContactState(NamedTuple):
@@ -199,12 +199,6 @@ def contact_model_settings(model: ContactModel) -> dict[str, Any]:
     return {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.metadata.get("static", False)}
 
 
-def _length(vector: Float[Array, "*b d"]) -> Float[Array, "*b"]:
-    """Length, with a derivative of zero at zero."""
-    square = jnp.sum(vector**2, axis=-1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-
-
 def _two_phase_jump(
     state: ContactState, smoothing: float, diagonal: Float[Array, " r"] | None = None, sliding: int = 0
 ) -> Jump:
@@ -225,125 +219,6 @@ def _two_phase_jump(
 
 def _velocity_jump(state: ContactState, impulse: Float[Array, "K d"]) -> Float[Array, "n d"]:
     return jnp.einsum("rid,r->id", state.response, impulse.reshape(-1))
-
-
-def solve_impulse(
-    A: Float[Array, "*b n n"],
-    v: Float[Array, "*b K d"],
-    friction: Float[Array, "*b K"],
-    lower: Float[Array, "*b K"],
-    *,
-    smoothing: float = 0.0,
-) -> Float[Array, "*b K d"]:
-    """Impulses `f` that minimise `1/2 f^T A f + f^T v` with `|f_t| <= mu f_n` and `f_n >= lower` for each contact.
-
-    **Arguments:** `A` (..., K d, K d), Delassus matrix (1/kg), positive semi-definite, contacts stacked with the normal
-    first; `v` (..., K, d), velocities before (m/s); `friction` (..., K), mu >= 0; `lower` (..., K), least normal
-    impulses (N s) >= 0; `smoothing`, final value of the complementarity products relative to the problem's scale: above
-    0 it smooths the derivative across stick, slip and separation.
-
-    **Returns:** `f` (..., K, d) in N s: the one of least norm where it is not unique. Batch axes and `jax.vmap` both
-    become one batch. Differentiable once, in both modes.
-
-    **Raises:** `CaromError` if shapes do not match, or values that are known (not traced) are out of range or give a
-    problem without a solution. Where values are traced, NaN data give NaN impulses.
-
-    **Source:** paper, eqs. 5 and 7.
-    """
-    _check_problem(A, v, friction=friction, lower=lower)
-    solution = _solve(A, v, friction, lower, smoothing)
-    _check_solved(solution, v.dtype)
-    return solution.impulse
-
-
-def contact_impulse(
-    A: Float[Array, "*b n n"],
-    v: Float[Array, "*b K d"],
-    friction: Float[Array, "*b K"],
-    restitution: Float[Array, "*b K"],
-    v_star: Float[Array, "*b K d"],
-    *,
-    smoothing: float = 0.0,
-) -> tuple[Float[Array, "*b K d"], Float[Array, "*b K d"]]:
-    """Compression and restitution impulses of the contact model CM, by Poisson's hypothesis.
-
-    **Arguments:** as `solve_impulse`; `restitution` (..., K), Poisson's e in [0, 1]; `v_star` (..., K, d), target
-    velocity after the impact (m/s), see `target_velocity`.
-
-    **Returns:** `(f_compression, f_restitution)`, each (..., K, d) in N s; the velocity jump is that of their sum.
-
-    **Raises:** `CaromError`, as `solve_impulse`.
-
-    **Source:** paper, S.14 and S.15.
-    """
-    _check_problem(A, v, friction=friction, restitution=restitution, v_star=v_star)
-    require_values("restitution", restitution, restitution <= 1, "between 0 and 1")
-    compression, rebound = two_phases(A, v, friction, restitution, v_star, smoothing=smoothing)
-    _check_solved(compression, v.dtype)
-    _check_solved(rebound, v.dtype)
-    return compression.impulse, rebound.impulse
-
-
-def two_phases(
-    A, v, friction, restitution, v_star, *, diagonal: Array | None = None, smoothing: float = 0.0, sliding: int = 0
-) -> tuple[ConeSolution, ConeSolution]:
-    """`contact_impulse` without its checks, with the solver's residuals.
-
-    `diagonal` (..., K d) is added to that of A in the convex programs alone, not where velocities are computed.
-    `sliding` programs in each phase undo the lift of contacts that slide (see `Coulomb`); 0: CM, which has it.
-    """
-    program = A if diagonal is None else A + diagonal[..., None] * jnp.eye(A.shape[-1], dtype=A.dtype)
-
-    # The phases differ in their data alone, so that they are one compiled solve, done twice.
-    def phase(state, is_rebound):
-        velocity, lower = state
-        velocity = velocity - jnp.where(is_rebound, v_star, 0)
-        least = jnp.where(is_rebound, lower, -jnp.inf)
-
-        def solved(start):
-            solution = _solve(program, start, friction, least, smoothing, reference=v)
-            return (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape), solution
-
-        def without_lift(search, _):
-            speed = _next_speed(search)
-            change, solution = solved(velocity.at[..., 0].add(friction * speed))
-            excess = _length((velocity + change)[..., 1:]) - speed
-            return _Search(speed, excess, search.speed, search.excess), (change, solution)
-
-        if sliding:
-            speed = _length(velocity[..., 1:])
-            start = _Search(speed, jnp.zeros_like(speed), speed, jnp.zeros_like(speed))
-            _, found = jax.lax.scan(without_lift, start, length=sliding)
-            change, solution = jax.tree.map(lambda s: s[-1], found)
-        else:
-            change, solution = solved(velocity)
-        lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
-        return (velocity + change, lower), solution
-
-    _, solutions = jax.lax.scan(phase, (v, jnp.zeros_like(friction)), jnp.array([False, True]))
-    return jax.tree.map(lambda s: s[0], solutions), jax.tree.map(lambda s: s[1], solutions)
-
-
-class _Search(NamedTuple):
-    """Speeds of sliding (..., K) that the last program was given and the one before, and how much more came out."""
-
-    speed: Float[Array, "*b K"]
-    excess: Float[Array, "*b K"]
-    speed_before: Float[Array, "*b K"]
-    excess_before: Float[Array, "*b K"]
-
-
-def _next_speed(search: _Search) -> Float[Array, "*b K"]:
-    """The speed of sliding to try next, for each contact where the excess would be zero if it were linear (secants).
-
-    It is linear for one contact that goes on sliding in its direction: the third program is then given the solution,
-    and has its derivative. Where there is no slope yet, the speed that came out.
-    """
-    plain = search.speed + search.excess
-    step, slope = search.speed - search.speed_before, search.excess - search.excess_before
-    usable = (jnp.abs(step) > 1e-12 * search.speed) & (jnp.abs(slope) > 0.1 * jnp.abs(step))
-    secant = search.speed - search.excess * step / jnp.where(usable, slope, 1)
-    return jnp.where(usable, jnp.clip(secant, 0, 3 * jnp.maximum(search.speed, plain)), plain)
 
 
 def target_velocity(
@@ -409,48 +284,3 @@ def _solve_regular(matrix, rhs, diagonal):
     diagonal = jnp.where(jnp.max(jnp.diag(matrix)) > 0, diagonal, 1)
     matrix = matrix + diagonal * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
-
-
-def _solve(A, v, friction, lower, smoothing, reference=None) -> ConeSolution:
-    batch = v.shape[:-2]
-
-    def flat(x: Array, rank: int) -> Array:
-        return x.reshape(-1, *x.shape[x.ndim - rank :])
-
-    out = solve_cone_problem(
-        *(flat(A, 2), flat(v, 2), flat(friction, 1), flat(lower, 1)),
-        reference=None if reference is None else flat(reference, 2),
-        smoothing=smoothing,
-    )
-    return ConeSolution(out.impulse.reshape(v.shape), out.residual.reshape(batch), out.iterations.reshape(batch))
-
-
-def _check_problem(A, v, *, friction, **others):
-    require(
-        v.ndim >= 2 and v.shape[-1] in (2, 3),
-        f"v must have the shape (..., contacts, d) with d = 2 or 3; it was {v.shape}.",
-    )
-    *batch, k, d = v.shape
-    shapes = {"A": (A, (*batch, k * d, k * d)), "friction": (friction, (*batch, k))}
-    for name, value in others.items():
-        shapes[name] = (value, (*batch, k, d) if name == "v_star" else (*batch, k))
-    for name, (value, shape) in shapes.items():
-        require(
-            value.shape == shape, f"{name} must have the shape {shape} to go with v {v.shape}; it was {value.shape}."
-        )
-    for name, value in {"A": A, "v": v, "friction": friction, **others}.items():
-        require_values(name, value, jnp.isfinite(value), "finite")
-        if name not in ("A", "v", "v_star"):
-            require_values(name, value, value >= 0, "at least 0")
-
-
-def _check_solved(solution: ConeSolution, dtype):
-    if is_known(solution.residual):
-        worst = float(jnp.max(solution.residual, initial=0))
-        tolerance = 100 * ConeSettings.for_dtype(dtype).tolerance
-        require(
-            worst <= tolerance,
-            f"the impulse was not found: the optimality conditions are off by {worst:.1e} (allowed {tolerance:.0e}). "
-            "Either A is not positive semi-definite, or the contacts squeeze a body from both sides and v cannot be "
-            "met by any impulse. Check A = J M^-1 J^T and that v and v_star are in the range of J.",
-        )
