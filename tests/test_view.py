@@ -22,15 +22,10 @@ from carom.mechanics.constraints import Distance, Joint, Tether
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 from carom.view.animate import animate
-from carom.view.figures import (
-    _quartiles,
-    contact_properties,
-    energy,
-    learning_curves,
-    trajectory_error,
-)
+from carom.view.figures import _quartiles, energy, trajectory_error
 from carom.view.scene import lines_of, touching
 from carom.view.style import DPI, ORANGE, TINT, theme
+from carom.view.training_figures import contact_properties, learning_curves
 
 NAN, INF = math.nan, math.inf
 HEADER = 58  # pixels above the scene, with legend and time
@@ -278,7 +273,8 @@ def test_nothing_global_changes(tmp_path):
 
 
 def test_pyplot_is_not_imported():
-    code = "import sys, carom.view.figures, carom.view.animate; print('matplotlib.pyplot' in sys.modules)"
+    modules = "carom.view.figures, carom.view.training_figures, carom.view.animate"
+    code = f"import sys, {modules}; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,

@@ -49,14 +49,14 @@ def pictures(
     run: RunFolder, system: System, test: Recording, predicted: Trajectory, found: Identification | None = None
 ) -> None:
     """Draw learning curves, contact properties, what data tell (`found`), error over time, and a test trajectory."""
-    from carom.view import animate, figures  # matplotlib is slow to import
+    from carom.view import animate, figures, training_figures  # matplotlib is slow to import
 
     metrics = run.metrics()
     if metrics:
-        figures.learning_curves(metrics, run.path / "learning_curves.png")
+        training_figures.learning_curves(metrics, run.path / "learning_curves.png")
     if metrics and metrics[-1]["friction"]:
         where, kept = run.path / "contact_properties.png", quantities(system)
-        figures.contact_properties(metrics, run.read_json(TRUTH), where, kept=kept)
+        training_figures.contact_properties(metrics, run.read_json(TRUTH), where, kept=kept)
     if found is not None and (found.friction or found.restitution or found.mass_ratio):
         from carom.view.estimates import draw_estimates
 

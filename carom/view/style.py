@@ -204,3 +204,25 @@ def power(value: float) -> str:
         return "0"
     digits, exponent = f"{value:.1e}".split("e")
     return rf"${digits} \times 10^{{{int(exponent)}}}$"
+
+
+def draw_line(axes: Axes, x: np.ndarray, y: np.ndarray, keep: np.ndarray, **style) -> bool:
+    """Draw the values to keep, as a dot if it is one; whether there were any."""
+    if not keep.any():
+        return False
+    axes.plot(x[keep], y[keep], marker="o" if keep.sum() == 1 else None, markersize=4, **style)
+    return True
+
+
+def draw_log_line(axes: Axes, x: np.ndarray, y: np.ndarray, **style) -> bool:
+    """Draw the finite positive values on a logarithmic axis; whether there were any."""
+    drawn = draw_line(axes, x, y, np.isfinite(y) & (y > 0), **style)
+    if drawn:
+        log_axis(axes)
+    return drawn
+
+
+def say_empty(axes: Axes, text: str) -> None:
+    """Say why a panel shows nothing."""
+    note(axes, text)
+    axes.set_yticks([])
