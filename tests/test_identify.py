@@ -186,6 +186,11 @@ def test_a_recording_of_another_system_is_refused():
         identify(carom.task("bp5"), carom.Recording.of(*np.zeros((2, 2, 9, 1, 2)), dt=0.01))
 
 
+def test_a_system_too_large_is_refused():
+    with refused("identify is for systems of up to 64 points; this one has 100."):
+        identify(carom.task("rope-100"), carom.Recording.of(*np.zeros((2, 2, 9, 100, 2)), dt=0.01))
+
+
 def test_robust_least_squares_ignores_outliers_and_knows_its_error():
     """A linear problem with 8 % of one-sided outliers, 200 times."""
     rng = np.random.default_rng(0)

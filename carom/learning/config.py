@@ -51,7 +51,7 @@ class LearnConfig:
     """Stop after so many epochs without a better validation loss."""
     refine: bool = True
     """Refine masses, contact properties and the potential's linear weights by Gauss-Newton steps: before the first
-    epoch, on the way and at the end. What validates better is kept. For up to 40 points, not for baselines."""
+    epoch, on the way and at the end. What validates better is kept. For up to 64 points, not for baselines."""
     enough: float = 1e-4
     """Stop after a refinement if nine tenths of the validation chunks are then predicted with a mean error below this
     share of the data's speed."""

@@ -25,7 +25,7 @@ from carom.simulation.impact import Stepper
 from carom.simulation.recording import Recording
 from carom.system import System
 
-MOST_POINTS = 40
+MOST_POINTS = 64
 """Largest system that is refined: derivatives of a step by the state before it grow with the cube of its size."""
 BATCH = 250
 """Steps that are looked at together."""
