@@ -10,6 +10,7 @@ from systems import refused
 
 import carom
 from carom.cli.main import main
+from carom.cli.reproduce import MINUTES, _minutes
 from carom.reproduction.jobs import Job
 from carom.reproduction.results import (
     collect,
@@ -252,6 +253,12 @@ def test_wrong_requests_are_refused(tmp_path, monkeypatch, capsys):
     (path / "config.json").write_text("{}")
     with refused("was learned with other settings. Choose another folder with --runs."):
         JOB.run(tmp_path / "runs" / "reproduce")
+
+
+def test_the_time_to_go_is_that_of_trainings_with_other_seeds():
+    earlier = {"runs": {"cp3-clnn-cm-seed0": {"seconds": 120.0}, "cp3-clnn-cm-seed2": {"seconds": 240.0}}}
+    assert _minutes(dataclasses.replace(JOB, seed=1), earlier) == 3.0
+    assert _minutes(Job("cp3", noise=0.05), earlier) == _minutes(JOB, None) == MINUTES["cp3"]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from carom.checks import require
 
 Choice = Literal["s1", "s2", "s3", "s4", "s5", "s6", "s7", "s8", "s9", "s10", "properties", "figure3", "all", "page"]
 MINUTES = {"bp5-e": 1.5, "bp5": 1.5, "bd5": 4, "cp3-e": 0.7, "cp3": 0.7, "gyro-e": 1, "gyro": 1.2, "rope": 2}
-"""What a training takes on two cores, about; other tasks longer."""
+"""What a training takes on two cores, about, where none like it was measured yet; other tasks longer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Reproduce:
         known = {} if earlier is None else results.known(wanted, earlier, seeds, quick=self.quick)
         todo = [job for job in jobs if not (folder / job.name / "report.json").exists() and job not in known]
         todo = [] if self.collect else todo
-        minutes = sum(MINUTES.get(job.task, 15.0) for job in todo) / self.workers
+        minutes = sum(_minutes(job, earlier) for job in todo) / self.workers
         console.print(
             f"{name}: {len(todo)} of {len(jobs)} trainings to do"
             + (f", about {minutes:.0f} minutes" if todo and not self.quick else ""),
@@ -123,6 +123,17 @@ class Reproduce:
             for done in concurrent.futures.as_completed(waiting):
                 keep(waiting[done], done.result())
                 console.print(f"{waiting[done].name}: done ({len(waiting)} in all)", highlight=False)
+
+
+def _minutes(job: Any, earlier: dict[str, Any] | None) -> float:
+    """What a training takes, about: as long as those of other seeds that the written table has."""
+    runs = {} if earlier is None else earlier["runs"]
+    measured = [run["seconds"] / 60 for name, run in runs.items() if _seedless(name) == _seedless(job.name)]
+    return sum(measured) / len(measured) if measured else MINUTES.get(job.task, 15.0)
+
+
+def _seedless(name: str) -> str:
+    return name.rpartition("-seed")[0]
 
 
 def _in_process(job: Any, folder: Path, quick: bool) -> dict[str, Any]:
