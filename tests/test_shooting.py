@@ -1,6 +1,7 @@
 """Unknowns estimated together with the start states of windows: from noisy recordings of a ball on a floor."""
 
 import dataclasses
+from contextlib import closing
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +9,13 @@ import pytest
 from systems import ball_on_floor
 
 import carom
+from carom.learning import shooting, train
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset, contact_flags
 from carom.learning.identify import identify
+from carom.learning.models import Unknowns
 from carom.learning.parameters import at_bounds, moved, physical_vector
+from carom.learning.run import RunFolder
 from carom.learning.shooting import Shooting, choose_windows, estimate, is_noisy, shoot, step_errors, window_directions
 from carom.learning.train import initial_unknowns
 from carom.simulation.impact import Stepper
@@ -134,6 +138,42 @@ def test_learning_says_that_starts_were_estimated(system, dataset):
     assert report.starts_estimated
     assert (report.epochs, report.refined, report.stopped_early) == (0, True, True)
     assert float(learned.friction[0]) == pytest.approx(FRICTION, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_resumed_training_remembers_what_was_estimated_at_first(system, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(shooting, "AS_GOOD", 0.0)  # never good enough: epochs follow
+    asked: list[Unknowns] = []
+
+    def at_first_only(unknowns, *rest, **options):
+        """Before the first epoch of the whole training and of the killed one; at their ends, nothing is found."""
+        asked.append(unknowns)
+        return estimate(unknowns, *rest, **options) if len(asked) in (1, 3) else None
+
+    monkeypatch.setattr(train, "estimate", at_first_only)
+    config = dataclasses.replace(CONFIG, epochs=4, checkpoint_every=1)
+    whole, expected = carom.learn(system, dataset, config, progress=False)
+    assert expected.starts_estimated
+    assert expected.epochs == 4
+
+    class KilledError(Exception):
+        pass
+
+    class Dying(RunFolder):
+        def log(self, metrics):
+            super().log(metrics)
+            if metrics["epoch"] == 3:
+                raise KilledError
+
+    with pytest.raises(KilledError), closing(Dying.create(tmp_path / "run", {})) as run:
+        carom.learn(system, dataset, config, run=run, progress=False)
+    with closing(RunFolder.open(tmp_path / "run")) as run:
+        resumed, report = carom.learn(system, dataset, config, run=run, progress=False)
+    assert len(asked) == 4
+    assert report.starts_estimated
+    assert report.val_loss == expected.val_loss
+    assert np.array_equal(resumed.friction, whole.friction)
+    assert np.array_equal(resumed.restitution, whole.restitution)
 
 
 def test_changes_of_the_unknowns_follow_their_vector(start):

@@ -67,6 +67,8 @@ class TrainState(eqx.Module):
     skipped: Int[Array, ""]
     overflow: Int[Array, ""]
     settled: Bool[Array, ""]  # masses and contact properties: they have been refined
+    shot: Unknowns  # estimated together with start states before the first epoch, if `shot_cost` is finite
+    shot_cost: Float[Array, ""]
 
 
 def initial_unknowns(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> Unknowns:
@@ -130,7 +132,9 @@ def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | No
     zero = jnp.asarray(0)
     infinity = jnp.asarray(jnp.inf)
     optimizer = fresh_optimizer(unknowns, config)
-    return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False))
+    return TrainState(
+        unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False), unknowns, infinity
+    )
 
 
 def learn(
@@ -215,12 +219,10 @@ class _Training:
 
     def go(self, progress: bool) -> tuple[System, LearnReport]:
         """Refine, learn for as many epochs as it takes, refine again: the learned system."""
-        config, stopped, refined, shot = self.config, False, False, None
+        config, stopped, refined = self.config, False, False
         with LoopProgress("epoch", config.epochs, int(self.state.epoch), shown=progress) as self.shown:
-            if self.refines and not self.resumed:
-                shot = self.begin()
+            done = self.refines and not self.resumed and self.begin()
             fit = self.judge(self.state.best)
-            done = shot is not None and shot.fits
             while not done and int(self.state.epoch) < config.epochs:
                 if (self.just_refined and fit.typical <= self.enough) or self.waited >= config.patience:
                     stopped = True
@@ -232,14 +234,12 @@ class _Training:
                 better = self.refined(best, fit, whole=True)
                 refined = better is not None
                 best, fit = (best, fit) if better is None else better
-            if self.refines and not done and (shot is not None or self.resumed):
-                shots = (shot, self.estimated(best))
-                shot = min((one for one in shots if one is not None), key=lambda one: one.cost, default=None)
-            if shot is not None:
-                best, fit, refined = shot.unknowns, self.judge(shot.unknowns), True
-        if best.potential is not None:
-            best = dataclasses.replace(best, potential=best.potential.pruned())
-        system = best.assemble(self.skeleton)
+            noisy = bool(np.isfinite(self.state.shot_cost))
+            if noisy:
+                shot = None if done else self.estimated(best)
+                best = self.state.shot if shot is None or self.state.shot_cost <= shot.cost else shot.unknowns
+                fit, refined = self.judge(_pruned(best)), True
+        system = _pruned(best).assemble(self.skeleton)
         report = LearnReport(
             **quantities(system),
             train_loss=self.loss if int(self.state.epoch) else None,
@@ -250,14 +250,14 @@ class _Training:
             skipped_steps=int(self.state.skipped),
             overflowed_contacts=int(self.state.overflow),
             refined=self.just_refined or refined,
-            starts_estimated=shot is not None,
+            starts_estimated=noisy,
         )
         return system, report
 
-    def begin(self) -> Shot | None:
-        """Refine the starting values; with noisy data, estimate start states too, and return what came of it.
+    def begin(self) -> bool:
+        """Refine the starting values; with noisy data, estimate start states too, and return whether that fits.
 
-        If that fits, it is the end; else training goes on from what was refined, and is resumed there.
+        Then it is the end; else training goes on from what was refined, and is resumed there.
         """
         fit = self.judge(self.state.unknowns)
         self.log(0, self.state.unknowns, refinement=0, val_loss=fit.mean)
@@ -266,12 +266,16 @@ class _Training:
         if shot is not None:
             number = next(self.refinements)
             self.log(0, shot.unknowns, refinement=number, val_loss=self.judge(shot.unknowns).mean)
-        if better is not None and not (shot is not None and shot.fits):
+            whole = _with_all_of(self.state.unknowns, shot.unknowns)
+            self.state = dataclasses.replace(self.state, shot=whole, shot_cost=jnp.asarray(shot.cost))
+            if shot.fits:
+                return True
+        if better is not None:
             self.settle(better)
             self.state = from_first(_keep_best(self.state, better[1].mean, 0))
             if self.run is not None:
                 self.run.save_checkpoint(0, self.state)
-        return shot
+        return False
 
     @property
     def just_refined(self) -> bool:
@@ -346,13 +350,8 @@ class _Training:
         self.shown.say("refining ...")
         best, full = None, unknowns.potential
 
-        def extended(new: Unknowns) -> Unknowns:
-            if full is None or new.potential is None:
-                return new
-            return dataclasses.replace(new, potential=new.potential.extended(full))
-
         def judge_step(new: Unknowns) -> Fit:
-            found = self.judge(extended(new))
+            found = self.judge(_with_all_of(unknowns, new))
             if not whole:
                 self.log(0, new, refinement=next(self.refinements), val_loss=found.mean)
             return found
@@ -361,16 +360,14 @@ class _Training:
             start = dataclasses.replace(unknowns, potential=potential)
             new, found = polish(start, self.trained, self.stepper, self.dataset.train, judge_step, EXACT * self.enough)
             if found.mean < fit.mean:
-                best, fit = (extended(new), found), found
+                best, fit = (_with_all_of(unknowns, new), found), found
             if found.typical <= self.enough:
                 break
         return best
 
     def estimated(self, unknowns: Unknowns) -> Shot | None:
         """Unknowns estimated together with start states, if the data are so noisy that this is called for."""
-        if unknowns.potential is not None:
-            unknowns = dataclasses.replace(unknowns, potential=unknowns.potential.pruned())
-
+        unknowns = _pruned(unknowns)
         number = itertools.count(1)
 
         def each() -> None:
@@ -410,6 +407,20 @@ def _epoch(state: TrainState, epoch: int, data: tuple[System, Recording, Chunks]
         state, unknowns=unknowns, optimizer=opt_state, epoch=jnp.asarray(epoch), overflow=overflow, skipped=skipped
     )
     return state, jnp.mean(jnp.stack(losses))
+
+
+def _with_all_of(full: Unknowns, unknowns: Unknowns) -> Unknowns:
+    """The same unknowns, with all parameters that the potential of `full` has."""
+    if full.potential is None or unknowns.potential is None:
+        return unknowns
+    return dataclasses.replace(unknowns, potential=unknowns.potential.extended(full.potential))
+
+
+def _pruned(unknowns: Unknowns) -> Unknowns:
+    """The same unknowns, without a network that makes no force."""
+    if unknowns.potential is None:
+        return unknowns
+    return dataclasses.replace(unknowns, potential=unknowns.potential.pruned())
 
 
 def _keep_best(state: TrainState, val_loss, epoch: int) -> TrainState:
