@@ -77,7 +77,7 @@ class Import:
     def _import(self) -> None:
         from carom.cli.tables import findings_table
         from carom.simulation.files import save_recording
-        from carom.simulation.pose_checks import check_poses, flight_noise
+        from carom.simulation.pose_checks import LATE, check_poses, flight_noise
         from carom.simulation.poses import at_samples, load_poses, velocity_lag, with_velocities
 
         width = self.size
@@ -96,9 +96,9 @@ class Import:
         findings = check_poses(poses, width)
         if self.estimate_velocities or poses.velocity is None or poses.omega is None:
             poses = with_velocities(poses)
-        elif abs(velocity_lag(poses)) > 0.25 * poses.dt:
+        elif abs(lag := velocity_lag(poses) / poses.dt) > LATE:
             # Differences of the past are half a sample old; what is measured is that, with noise.
-            poses = at_samples(poses, 0.5 * poses.dt * round(2 * velocity_lag(poses) / poses.dt))
+            poses = at_samples(poses, 0.5 * poses.dt * round(2 * lag))
         about = f"{self.file.name}, width {width} m" + (f", mass {self.mass} kg" if self.mass else "")
         save_recording(out, poses.to_recording(task=self.task, source=about))
         console = Console()

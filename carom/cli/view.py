@@ -22,7 +22,7 @@ from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
 from carom.simulation.files import load_recording
 from carom.simulation.impact import COMPENSATION_STEPS
-from carom.simulation.recording import Recording
+from carom.simulation.recording import Recording, check_system
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 
@@ -102,12 +102,7 @@ class View:
             f"{self.run_or_file} does not say of which task it is. Give its name, or a Python file, with --task.",
         )
         system = (chosen or choose(name)).system
-        shape = (system.n_points, system.dim)
-        require(
-            recording.x.shape[2:] == shape,
-            f"{self.run_or_file} has {recording.n_points} points in {recording.dim}D, {name} has {shape[0]} in "
-            f"{shape[1]}D. Is it a file of another task?",
-        )
+        check_system(recording, system, str(self.run_or_file))
         recording = self._some(recording)
         pairs = [(None, trajectory_of(recording, k)) for k in range(recording.n_trajectories)]
         return _Shown(system, pairs, name, COMPENSATION_STEPS)

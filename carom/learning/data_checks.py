@@ -6,7 +6,7 @@ import numpy as np
 from carom.checks import require
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset, closed_contacts
-from carom.simulation.recording import Recording
+from carom.simulation.recording import Recording, check_system
 from carom.system import System
 
 LARGEST_DRIFT = 5e-2
@@ -15,12 +15,7 @@ LARGEST_DRIFT = 5e-2
 
 def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> int:
     """Raise `CaromError` where data and skeleton do not fit; return the largest number of contacts closed at once."""
-    shape = (skeleton.n_points, skeleton.dim)
-    require(
-        dataset.train.x.shape[2:] == shape,
-        f"the data have {dataset.train.x.shape[2]} points in {dataset.train.x.shape[3]}D, the system has {shape[0]} in "
-        f"{shape[1]}D. Is this a file of another task?",
-    )
+    check_system(dataset.train, skeleton, "the training recording")
     require(
         int(dataset.train.length.max()) >= config.states,
         f"chunk_length is {config.states} states, but the longest training trajectory has "

@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from carom.checks import require
 from carom.learning.baselines import physical_quantities
 from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.impact import COMPENSATION_STEPS
-from carom.simulation.recording import Recording
+from carom.simulation.recording import Recording, check_system
 from carom.simulation.rollout import Trajectory, simulate
 from carom.system import System
 
@@ -109,12 +108,7 @@ def evaluate(
 
     **Raises:** `CaromError` if the recording is of another system.
     """
-    shape = (system.n_points, system.dim)
-    require(
-        recording.x.shape[2:] == shape,
-        f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {shape[0]} in "
-        f"{shape[1]}D. Is it a file of another task?",
-    )
+    check_system(recording, system)
     predicted = predict(system, recording, formulation=formulation, compensation_steps=compensation_steps)
     relative, bounded = state_errors(recording, predicted)
     later, later_bounded = relative[:, 1:], bounded[:, 1:]

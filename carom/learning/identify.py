@@ -49,7 +49,7 @@ from carom.learning.sensitivity import StepSensitivity
 from carom.learning.shooting import shoot, shooting_of
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.impact import COMPENSATION_STEPS, Stepper
-from carom.simulation.recording import Recording
+from carom.simulation.recording import Recording, check_system
 from carom.system import System
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified"]
@@ -112,11 +112,7 @@ def identify(
         system.n_points <= MOST_POINTS,
         f"identify is for systems of up to {MOST_POINTS} points; this one has {system.n_points}.",
     )
-    require(
-        recording.x.shape[2:] == (system.n_points, system.dim),
-        f"the recording has {recording.x.shape[2]} points in {recording.x.shape[3]}D, the system {system.n_points} in "
-        f"{system.dim}D. Is it a file of another task?",
-    )
+    check_system(recording, system)
     stepper = Stepper(
         dt=jnp.asarray(recording.dt),
         formulation=formulation,

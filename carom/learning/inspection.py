@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from carom.checks import require
 from carom.contact.limits import BendLimit, StretchLimit
 from carom.learning.config import LearnConfig
 from carom.learning.data_checks import LARGEST_DRIFT
@@ -14,7 +13,7 @@ from carom.learning.dataset import Chunks, all_gaps, closing, contact_flags
 from carom.learning.refine import IdentifyConfig
 from carom.mechanics.constraints import Rigid
 from carom.mechanics.potentials import Gravity
-from carom.simulation.recording import Recording
+from carom.simulation.recording import Recording, check_system
 from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
 
@@ -37,12 +36,7 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
 
     **Raises:** `CaromError` if the recording is of another number of points or dimension.
     """
-    shape = (system.n_points, system.dim)
-    require(
-        recording.x.shape[2:] == shape,
-        f"the recording has {recording.n_points} points in {recording.dim}D, the system {shape[0]} in {shape[1]}D. "
-        "Give a recording of this system: point masses have one point, rigid bodies d + 1.",
-    )
+    check_system(recording, system)
     config = LearnConfig() if config is None else config
     out = check_recording(recording)
     if system.links:

@@ -13,12 +13,16 @@ from carom.simulation.recording_checks import Finding
 STANDARD_GRAVITY = 9.81
 
 
+LATE = 0.25
+"""Velocities that are older than this share of a sample are differences of the past."""
+
+
 def check_poses(poses: PoseRecording, width: float) -> list[Finding]:
     """What a tossed cube of this nominal `width` (m) shows; everything is measured on the recording."""
     out = [_gravity(poses), _rest_height(poses, width), _lowest(poses, width), _tilt(poses), _mass(poses, width)]
     if poses.velocity is not None:
         lag = velocity_lag(poses) / poses.dt
-        late = abs(lag) > 0.25
+        late = abs(lag) > LATE
         out.append(
             Finding(
                 "velocities are late by",

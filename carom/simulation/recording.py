@@ -7,7 +7,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from carom.checks import require
 from carom.errors import CaromError
+from carom.system import System
 
 STEP_TOLERANCE = 1e-6
 """Largest difference of two time steps that count as equal, relative to the step."""
@@ -98,6 +100,15 @@ class Recording(eqx.Module):
         rows = np.arange(self.n_trajectories)[indices].reshape(-1)
         contact, group = (None if part is None else part[rows] for part in (self.contact, self.group))
         return replace(self, x=self.x[rows], v=self.v[rows], contact=contact, length=self.length[rows], group=group)
+
+
+def check_system(recording: Recording, system: System, what: str = "the recording") -> None:
+    """Raise `CaromError` unless the recording, which the message calls `what`, has the points of the system."""
+    require(
+        (recording.n_points, recording.dim) == (system.n_points, system.dim),
+        f"{what} has {recording.n_points} points in {recording.dim}D, the system {system.n_points} in {system.dim}D. "
+        "Is it of another system? Point masses have one point, rigid bodies d + 1.",
+    )
 
 
 def require_part(good: bool, name: str, wanted: str, was: Any, advice: str = "correct it") -> None:
