@@ -33,7 +33,10 @@ def report_of(cell: Cell, value: float) -> dict:
     filled = {"friction": [value] * 40, "restitution": [value] * 40, "mass_ratio": [value] * 12}
     provenance = {"digest": "x", "seconds": 60.0, "carom": "0", "jax": "0"}
     errors = {name: {"trajectory_error": value, "bounded_error": 0.75} for name in ("cm", "lcp")}
-    curve = {name: {"mean": [0.0, value], "ci95": [0.0, value / 2], "median": [0.0, value]} for name in CURVES}
+    # Errors that grow, and are lost after 30 steps: a report has null there.
+    rise = [value * k for k in range(31)] + [None] * 5
+    half = [None if v is None else v / 2 for v in rise]
+    curve = {name: {"mean": rise, "ci95": half, "median": rise} for name in CURVES}
     told = {name: [{"standard_error": value / 10}] * 40 for name in ("friction", "restitution")}
     return {
         "learned": filled,
@@ -129,9 +132,32 @@ def test_what_a_written_table_has_stays(tmp_path):
     assert again["cells"][0]["carom"] == pytest.approx(0.65)
     assert list(again["cells"][0]["by_seed"]) == ["0", "2"]
     assert set(again["runs"]) == {jobs[0].name, jobs[2].name}
+    # Asking for fewer seeds loses nothing.
+    fewer = collect(wanted, {}, seeds=1, quick=False, earlier={**again, "runs": {**again["runs"], **of_today(jobs)}})
+    assert list(fewer["cells"][0]["by_seed"]) == ["0", "2"]
     # A training that is there now counts, not what was written of it.
     anew = collect(wanted, {jobs[0]: report_of(cell, 0.7)}, seeds=3, quick=False, earlier=earlier)
     assert anew["cells"][0]["by_seed"]["0"]["value"] == 0.7
+
+
+def of_today(jobs: list[Job]) -> dict:
+    """Runs of these jobs, with the settings that they have now."""
+    return {job.name: {"digest": job.digest(), "seconds": 1.0} for job in jobs}
+
+
+def test_errors_over_time_that_were_written_stay():
+    wanted = table("figure3")
+    cell = wanted.cells[0]
+    assert cell.job is not None
+    jobs = [dataclasses.replace(cell.job, seed=seed) for seed in range(2)]
+    earlier = collect(wanted, {jobs[0]: report_of(cell, 0.5)}, seeds=2, quick=False)
+    earlier["runs"] = of_today(jobs[:1])
+    del earlier["cells"][0]["by_seed"]["0"]["early"]  # measured before there was such a number
+    both = collect(wanted, {jobs[1]: report_of(cell, 1.5)}, seeds=2, quick=False, earlier=earlier)
+    (curve,) = both["over_time"]
+    assert list(mean_over_seeds(curve, "state")["mean"][:3]) == [0.0, 1.0, 2.0]
+    assert both["cells"][0]["carom"] == 1.0
+    assert "early" not in both["cells"][0]  # of one of two seeds
 
 
 def test_a_damaged_table_is_refused(tmp_path):
@@ -194,10 +220,12 @@ def test_standard_errors_and_pictures(tmp_path):
     jobs = [job for job in wanted.jobs(2) if job.task in ("cp3", "gyro")]
     content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=2, quick=False)
     (first,) = [c for c in content["over_time"] if (c["row"], c["column"]) == ("CM-CD-CLNN", "cp3")]
-    assert list(mean_over_seeds(first, "state")["mean"]) == [0.0, 0.5]
+    assert list(mean_over_seeds(first, "state")["mean"][:3]) == [0.0, 0.5, 1.0]
+    assert np.isnan(mean_over_seeds(first, "state")["mean"][-1])
     assert mean_over_seeds(first, "energy")["ci95"][1] == pytest.approx(0.25 / np.sqrt(2), rel=1e-3)
     assert len(content["over_time"]) == 14
-    assert content["cells"][28]["early"] == 0.5
+    (cell,) = [cell for cell in content["cells"] if (cell["row"], cell["column"]) == ("CM-CD-CLNN", "cp3")]
+    assert cell["early"] == pytest.approx(0.5 * 10.5)  # the mean of steps 1 to 20
     assert "of carom, first 20 steps" in markdown(content)
     write(content, tmp_path)
     drawn = pictures(tmp_path, tmp_path / "images")
@@ -243,6 +271,10 @@ def test_wrong_requests_are_refused(tmp_path, monkeypatch, capsys):
         (["s3", "--seeds", "0"], "seeds must be at least 1; it was 0"),
         (["s3", "--only", "cp4"], "only must be in the name of a training of s3, e.g. cp3-clnn-cm-seed0; it was 'cp4'"),
         (["s3", "--workers", "0"], "workers must be at least 1; it was 0"),
+        (
+            ["all", "--only", "cp4"],
+            "only must be in the name of a training of all, e.g. bp5-e-clnn-cm-seed0; it was 'cp4'",
+        ),
     ):
         with pytest.raises(SystemExit) as stopped:
             main(["reproduce", *arguments])
@@ -259,6 +291,13 @@ def test_the_time_to_go_is_that_of_trainings_with_other_seeds():
     earlier = {"runs": {"cp3-clnn-cm-seed0": {"seconds": 120.0}, "cp3-clnn-cm-seed2": {"seconds": 240.0}}}
     assert _minutes(dataclasses.replace(JOB, seed=1), earlier) == 3.0
     assert _minutes(Job("cp3", noise=0.05), earlier) == _minutes(JOB, None) == MINUTES["cp3"]
+
+
+def test_all_tables_leave_out_those_that_are_not_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(["reproduce", "all", "--only", "noise", "--collect", "--seeds", "1"])
+    assert "s6: 0 of 4 trainings to do" in capsys.readouterr().out
+    assert [path.name for path in sorted((tmp_path / "results").iterdir())] == ["s6.json", "s6.md"]
 
 
 @pytest.mark.slow

@@ -16,7 +16,16 @@ from carom.learning.identify import identify
 from carom.learning.models import Unknowns
 from carom.learning.parameters import at_bounds, moved, physical_vector
 from carom.learning.run import RunFolder
-from carom.learning.shooting import Shooting, choose_windows, estimate, is_noisy, shoot, step_errors, window_directions
+from carom.learning.shooting import (
+    Shooting,
+    Shot,
+    choose_windows,
+    estimate,
+    is_noisy,
+    shoot,
+    step_errors,
+    window_directions,
+)
 from carom.learning.train import initial_unknowns
 from carom.simulation.impact import Stepper
 from carom.simulation.recording import Recording
@@ -143,12 +152,12 @@ def test_learning_says_that_starts_were_estimated(system, dataset):
 @pytest.mark.slow
 def test_a_resumed_training_remembers_what_was_estimated_at_first(system, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(shooting, "AS_GOOD", 0.0)  # never good enough: epochs follow
-    asked: list[Unknowns] = []
+    rivals: list[Unknowns | None] = []
 
-    def at_first_only(unknowns, *rest, **options):
-        """Before the first epoch of the whole training and of the killed one; at their ends, nothing is found."""
-        asked.append(unknowns)
-        return estimate(unknowns, *rest, **options) if len(asked) in (1, 3) else None
+    def at_first_only(*arguments, rival, **options):
+        """Before the first epoch of the whole training and of the killed one; at their ends, what was found then."""
+        rivals.append(rival)
+        return estimate(*arguments, **options) if rival is None else Shot(rival, fits=False)
 
     monkeypatch.setattr(train, "estimate", at_first_only)
     config = dataclasses.replace(CONFIG, epochs=4, checkpoint_every=1)
@@ -169,7 +178,7 @@ def test_a_resumed_training_remembers_what_was_estimated_at_first(system, datase
         carom.learn(system, dataset, config, run=run, progress=False)
     with closing(RunFolder.open(tmp_path / "run")) as run:
         resumed, report = carom.learn(system, dataset, config, run=run, progress=False)
-    assert len(asked) == 4
+    assert [rival is not None for rival in rivals] == [False, True, False, True]
     assert report.starts_estimated
     assert report.val_loss == expected.val_loss
     assert np.array_equal(resumed.friction, whole.friction)

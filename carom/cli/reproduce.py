@@ -51,7 +51,7 @@ class Reproduce:
     def run(self) -> None:
         """Do it."""
         from carom.reproduction import results
-        from carom.reproduction.tables import BUILDERS
+        from carom.reproduction.tables import BUILDERS, table
 
         console = Console()
         require(self.seeds >= 1, f"seeds must be at least 1; it was {self.seeds}.")
@@ -65,7 +65,14 @@ class Reproduce:
             for path in results.pictures(self.results, self.page.parent / "images"):
                 console.print(f"Drawn: {path}", soft_wrap=True, highlight=False)
             return
-        for name in BUILDERS if self.table == "all" else [self.table]:
+        names: list[Any] = list(BUILDERS) if self.table == "all" else [self.table]
+        every = {name: [job.name for job in table(name).jobs(self.seeds)] for name in names}
+        wanted = [name for name in names if not every[name] or any(self.only in job for job in every[name])]
+        require(
+            any(self.only in job for name in names for job in every[name]),
+            f"only must be in the name of a training of {self.table}, e.g. {every[names[0]][0]}; it was {self.only!r}.",
+        )
+        for name in wanted:
             self._one(name, console)
 
     def _one(self, name: Any, console: Console) -> None:
@@ -77,11 +84,6 @@ class Reproduce:
         seeds, folder = (1, self.runs / "quick") if self.quick else (self.seeds, self.runs)
         every = wanted.jobs(seeds)
         jobs = [job for job in every if self.only in job.name]
-        require(
-            bool(jobs) or not every,
-            f"only must be in the name of a training of {name}, e.g. {every[0].name if every else ''}; it was "
-            f"{self.only!r}.",
-        )
         jobs = jobs[:2] if self.quick else jobs
         into = self.results / "quick" if self.quick else self.results
         earlier = results.written(name, into)

@@ -357,13 +357,9 @@ AS_GOOD = 1.25
 
 
 class Shot(NamedTuple):
-    """Unknowns estimated together with the start states of windows.
-
-    `cost`, of windows of the validation data; `fits`, whether windows are as well predicted as single steps.
-    """
+    """Unknowns estimated together with the start states of windows; whether these are as well predicted as steps."""
 
     unknowns: Unknowns
-    cost: float
     fits: bool
 
 
@@ -393,10 +389,12 @@ def estimate(
     *,
     seed: int,
     each: Callable[[], None] | None = None,
+    rival: Unknowns | None = None,
 ) -> Shot | None:
     """Unknowns and start states together, where recorded states are noisier than `NOISE` of what a step moves.
 
-    None for data with less noise, or with no room for enough windows. Frictions and restitutions near a bound are put
+    None for data with less noise, or with no room for enough windows. Of what comes out and `rival`, that which fits
+    windows of the validation data better, by the same sizes of errors. Frictions and restitutions near a bound are put
     there if windows of the validation data then fit at least as well.
     """
     shooting = shooting_of(unknowns, skeleton, stepper, dataset.train, seed=seed)
@@ -411,8 +409,10 @@ def estimate(
         cost_there = held_out.fit(there)
         if cost_there <= cost * (1 + AS_WELL):
             found, cost = there, cost_there
+    if rival is not None and held_out.fit(rival) < cost:
+        found = rival
     single = step_errors(found, skeleton, stepper, dataset.train, seed=seed)
-    return Shot(found, cost, bool(np.all(shooting.errors <= AS_GOOD * single)))
+    return Shot(found, bool(np.all(shooting.errors <= AS_GOOD * single)))
 
 
 def step_errors(

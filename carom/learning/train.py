@@ -67,8 +67,8 @@ class TrainState(eqx.Module):
     skipped: Int[Array, ""]
     overflow: Int[Array, ""]
     settled: Bool[Array, ""]  # masses and contact properties: they have been refined
-    shot: Unknowns  # estimated together with start states before the first epoch, if `shot_cost` is finite
-    shot_cost: Float[Array, ""]
+    shot: Unknowns  # estimated together with start states before the first epoch, if `has_shot`
+    has_shot: Bool[Array, ""]
 
 
 def initial_unknowns(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> Unknowns:
@@ -132,9 +132,8 @@ def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | No
     zero = jnp.asarray(0)
     infinity = jnp.asarray(jnp.inf)
     optimizer = fresh_optimizer(unknowns, config)
-    return TrainState(
-        unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, jnp.asarray(False), unknowns, infinity
-    )
+    no = jnp.asarray(False)
+    return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, no, unknowns, no)
 
 
 def learn(
@@ -234,11 +233,12 @@ class _Training:
                 better = self.refined(best, fit, whole=True)
                 refined = better is not None
                 best, fit = (best, fit) if better is None else better
-            noisy = bool(np.isfinite(self.state.shot_cost))
-            if noisy:
-                shot = None if done else self.estimated(best)
-                best = self.state.shot if shot is None or self.state.shot_cost <= shot.cost else shot.unknowns
-                fit, refined = self.judge(_pruned(best)), True
+            shot = _pruned(self.state.shot) if self.state.has_shot else None
+            if shot is not None and not done:
+                found = self.estimated(best, rival=shot)
+                shot = None if found is None else found.unknowns  # what was learned since says that nothing is noisy
+            if shot is not None:
+                best, fit, refined = shot, self.judge(shot), True
         system = _pruned(best).assemble(self.skeleton)
         report = LearnReport(
             **quantities(system),
@@ -250,7 +250,7 @@ class _Training:
             skipped_steps=int(self.state.skipped),
             overflowed_contacts=int(self.state.overflow),
             refined=self.just_refined or refined,
-            starts_estimated=noisy,
+            starts_estimated=shot is not None,
         )
         return system, report
 
@@ -267,7 +267,7 @@ class _Training:
             number = next(self.refinements)
             self.log(0, shot.unknowns, refinement=number, val_loss=self.judge(shot.unknowns).mean)
             whole = _with_all_of(self.state.unknowns, shot.unknowns)
-            self.state = dataclasses.replace(self.state, shot=whole, shot_cost=jnp.asarray(shot.cost))
+            self.state = dataclasses.replace(self.state, shot=whole, has_shot=jnp.asarray(True))
             if shot.fits:
                 return True
         if better is not None:
@@ -365,15 +365,16 @@ class _Training:
                 break
         return best
 
-    def estimated(self, unknowns: Unknowns) -> Shot | None:
-        """Unknowns estimated together with start states, if the data are so noisy that this is called for."""
+    def estimated(self, unknowns: Unknowns, *, rival: Unknowns | None = None) -> Shot | None:
+        """Unknowns estimated together with start states, if the data are so noisy that it is called for; or `rival`."""
         unknowns = _pruned(unknowns)
         number = itertools.count(1)
 
         def each() -> None:
             self.shown.say(f"noisy data: estimating start states too, step {next(number)} ...")
 
-        return estimate(unknowns, self.trained, self.stepper, self.dataset, seed=self.config.seed, each=each)
+        data = (self.trained, self.stepper, self.dataset)
+        return estimate(unknowns, *data, seed=self.config.seed, each=each, rival=rival)
 
 
 def _validation_chunks(val: Recording, skeleton: System, config: LearnConfig):

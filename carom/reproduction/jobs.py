@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import platform
 import subprocess
 import time
 from collections.abc import Callable
@@ -101,12 +102,15 @@ class Job:
             require(before == now, f"{path} was learned with other settings. Choose another folder with --runs.")
             if (path / REPORT).exists():
                 return run.read_json(REPORT)
-            started = time.monotonic()
+            learned_by, started = commit(), time.monotonic()
             truth = task(self.task)
             dataset, tests = self._data(quick)
             if say is not None:
                 say(f"{self.name}: learning from {dataset.train.n_trajectories} trajectories")
+            before_learning = time.monotonic()
             system, report = learn(truth, dataset, self._quickened() if quick else self.config(), run=run)
+            # Of a training that was stopped, what it had taken by then counts.
+            started += time.monotonic() - before_learning - report.seconds
             save_model(path / MODEL, system, formulation=FORMULATIONS[self.model])
             measures, curves = {}, {}
             for name, test in tests.items():
@@ -119,7 +123,8 @@ class Job:
                 "provenance": {
                     "digest": self.digest(quick),
                     "seconds": round(time.monotonic() - started, 1),
-                    "commit": commit(),
+                    "commit": learned_by,
+                    "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
                     "carom": carom.__version__,
                     "jax": jax.__version__,
                 },
@@ -162,15 +167,14 @@ class Job:
 
 
 def commit() -> str | None:
-    """The commit of the checkout that the package is in, if it is in one."""
+    """The commit of the checkout that the package is in, if it is in one, and a + where the package was changed."""
+
+    def git(*arguments: str) -> str:
+        here = Path(__file__).parents[1]
+        command = ["git", "-C", str(here), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+
     try:
-        out = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
+        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", ".") else "")
     except (OSError, subprocess.SubprocessError):
         return None
-    return out.stdout.strip()

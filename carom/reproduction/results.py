@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import json
-import platform
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -65,9 +64,9 @@ def measured(cell: Cell, values: list[float | None], errors: list[float | None] 
         "note": cell.note,
         "counted": cell.counted,
     }
-    standard_error = _mean_where_known(errors or [])
-    if standard_error is not None:
-        out["standard_error"] = standard_error
+    known = [e for e in errors or [] if e is not None]
+    if known:
+        out["standard_error"] = float(np.mean(known))
     if cell.job is None or paper_error is None:
         return out
     if error is None:
@@ -93,8 +92,9 @@ def collect(
     """All cells of a table, by the seeds that have a report, with where they come from.
 
     `earlier`: the table as it was written before. What it has of trainings with the same settings stays, where there is
-    no report of them now.
+    no report of them now: of more seeds than `seeds`, too.
     """
+    seeds = max([seeds, *(1 + int(name.rpartition("-seed")[2]) for name in (earlier or {"runs": {}})["runs"])])
     kept = {} if earlier is None else known(table, earlier, seeds, quick=quick)
     kept = {job: run for job, run in kept.items() if job not in reports}
     before = _written_by_place(earlier, "cells")
@@ -103,9 +103,9 @@ def collect(
         found = _by_seed(cell, functools.partial(_entry, cell), reports, kept, before, seeds)
         if found:
             entry = measured(cell, _column(found, "value"), _column(found, "standard_error"))
-            other = ["early"] if entry["carom"] is not None else ["early", "bounded"]
-            means = {name: _mean_where_known(_column(found, name)) for name in other}
-            cells.append({**entry, **{k: v for k, v in means.items() if v is not None}, "by_seed": found})
+            if entry["carom"] is None:
+                entry |= _mean_of_all("bounded", found)
+            cells.append({**entry, **_mean_of_all("early", found), "by_seed": found})
         elif cell.job is None:
             cells.append(measured(cell, []))
         else:
@@ -127,7 +127,6 @@ def collect(
         "summary": summary(cells),
         "runs": {job.name: report["provenance"] for job, report in reports.items()}
         | {job.name: {"commit": None, **run} for job, run in kept.items()},
-        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
         **({"over_time": curves} if curves else {}),
     }
 
@@ -186,17 +185,21 @@ def _column(by_seed: dict[str, dict[str, float | None]], name: str) -> list[floa
     return [entry.get(name) for entry in by_seed.values()]
 
 
-def _mean_where_known(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _mean_of_all(name: str, by_seed: dict[str, dict[str, float | None]]) -> dict[str, float]:
+    """The mean over seeds of a number that all of them have; nothing where one has not."""
+    values = [value for value in _column(by_seed, name) if value is not None]
+    return {name: float(np.mean(values))} if len(values) == len(by_seed) else {}
 
 
-def _curves(cell: Cell, report: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
-    """Errors over time that one training has, by quantity: means, halves of 95 % intervals, medians."""
+def _curves(cell: Cell, report: dict[str, Any]) -> dict[str, dict[str, list[float | None]]]:
+    """Errors over time that one training has, by quantity: means, halves of 95 % intervals, medians.
+
+    None where they are not finite.
+    """
     assert cell.job is not None
     found = report["over_time"][cell.job.data]
     return {
-        quantity: {name: [float(f"{v:.3g}") for v in values] for name, values in found[quantity].items()}
+        quantity: {name: [v and float(f"{v:.3g}") for v in values] for name, values in found[quantity].items()}
         for quantity in PICTURES
     }
 
@@ -242,7 +245,7 @@ def write(content: dict[str, Any], folder: Path) -> Path:
     """Write `TABLE.json` and `TABLE.md` into the folder; returns the former's path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{content['table']}.json"
-    text = json.dumps(content, indent=1)
+    text = json.dumps(content, indent=1, allow_nan=False)
     lists_on_a_line = re.sub(r"\[[^][{}\"]*\]", lambda found: " ".join(found[0].split()), text)
     write_whole(path, (lists_on_a_line + "\n").encode())
     write_whole(path.with_suffix(".md"), markdown(content).encode())
@@ -298,8 +301,6 @@ def markdown(content: dict[str, Any]) -> str:
         ]
     if content["note"]:
         lines += ["", content["note"]]
-    if "over_time" in content:
-        lines += [""] + [f"![{name.removesuffix('.png')}](images/{name})" for name in PICTURES.values()]
     if content["runs"]:
         commits = sorted({run["commit"] for run in content["runs"].values() if run.get("commit")})
         count = len(content["runs"])
@@ -307,7 +308,7 @@ def markdown(content: dict[str, Any]) -> str:
         lines += [
             "",
             f"{count} training{'s' * (count != 1)} ({_seeds(content)}), {seconds / 60:.0f} minutes together; "
-            f"{content['machine']}"
+            f"{'; '.join(sorted({run['machine'] for run in content['runs'].values() if 'machine' in run}))}"
             + (f"; commit {', '.join(commits)}" if commits else "")
             + f". `carom reproduce {content['table']}`.",
         ]
@@ -356,8 +357,11 @@ def page(folder: Path) -> str:
     for name in BUILDERS:
         path = folder / f"{name}.json"
         if path.exists():
-            content = json.loads(path.read_text())
+            content = written(name, folder)
+            assert content is not None
             parts.append(markdown(content))
+            if "over_time" in content:
+                parts.append("\n".join(f"![{file.removesuffix('.png')}](images/{file})" for file in PICTURES.values()))
             total = {key: total[key] + content["summary"][key] for key in total}
             worse += _worse(content)
     lines += [
@@ -375,9 +379,8 @@ def page(folder: Path) -> str:
 
 def pictures(folder: Path, images: Path) -> list[Path]:
     """Draw errors over time, if the folder has `figure3`; returns the PNGs' paths."""
-    path = folder / "figure3.json"
-    content = json.loads(path.read_text()) if path.exists() else {}
-    if "over_time" not in content:
+    content = written("figure3", folder)
+    if content is None or "over_time" not in content:
         return []
     from carom.reproduction.figure import draw  # matplotlib is slow to import
 
