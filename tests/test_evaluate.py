@@ -66,5 +66,5 @@ def test_a_prediction_that_is_lost_counts_as_lost(elastic):
 
 
 def test_a_recording_of_another_system_is_refused(elastic):
-    with pytest.raises(carom.CaromError, match="another task"):
+    with pytest.raises(carom.CaromError, match="Is it of another system"):
         carom.evaluate(carom.task("bp5"), elastic[1])

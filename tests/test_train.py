@@ -130,13 +130,14 @@ def test_the_refinement_at_the_end_brings_all_that_is_learned_nearer(cp3, cp3_da
 
 
 def test_what_can_be_refined(cp3):
-    unknowns, rope = initial_unknowns(cp3, TINY), carom.task("rope-50")
+    unknowns, (rope, longer) = initial_unknowns(cp3, TINY), (carom.task(name) for name in ("rope-50", "rope-100"))
     baseline = eqx.tree_at(lambda u: u.step_model, unknowns, carom.Gravity((0.0, -1.0)), is_leaf=lambda a: a is None)
     assert can_be_refined(unknowns, cp3)
     assert not can_be_refined(unknowns, in_single_precision(cp3))
     assert not can_be_refined(Unknowns(None, None, None, None), cp3)
     assert not can_be_refined(baseline, cp3)
-    assert not can_be_refined(initial_unknowns(rope, TINY), rope)
+    assert can_be_refined(initial_unknowns(rope, TINY), rope)
+    assert not can_be_refined(initial_unknowns(longer, TINY), longer)
 
 
 def test_single_precision_is_said_to_refine_nothing(cp3, cp3_data):
