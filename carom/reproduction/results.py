@@ -355,10 +355,8 @@ def page(folder: Path) -> str:
     total = {"compared": 0, "met": 0, "better": 0}
     parts, worse = [], []
     for name in BUILDERS:
-        path = folder / f"{name}.json"
-        if path.exists():
-            content = written(name, folder)
-            assert content is not None
+        content = written(name, folder)
+        if content is not None:
             parts.append(markdown(content))
             if "over_time" in content:
                 parts.append("\n".join(f"![{file.removesuffix('.png')}](images/{file})" for file in PICTURES.values()))
