@@ -12,19 +12,10 @@ import carom
 from carom.cli.main import main
 from carom.cli.reproduce import MINUTES, _minutes
 from carom.reproduction.jobs import Job
-from carom.reproduction.results import (
-    collect,
-    known,
-    markdown,
-    mean_over_seeds,
-    measured,
-    page,
-    pictures,
-    write,
-    written,
-)
+from carom.reproduction.pages import brief, markdown, page, pictures, write
+from carom.reproduction.results import collect, known, mean_over_seeds, measured, written
 from carom.reproduction.tables import BUILDERS, Cell, paper, table
-from carom.tasks import noisy
+from carom.tasks import noisy, task
 from carom.tasks.pendulums import chain_angles, chain_state
 
 
@@ -216,6 +207,7 @@ def test_standard_errors_and_pictures(tmp_path):
     content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=1, quick=False)
     assert content["cells"][0]["standard_error"] == pytest.approx(0.05)
     assert "| standard error |" in markdown(content)
+    write(content, tmp_path)
     wanted = table("figure3")
     jobs = [job for job in wanted.jobs(2) if job.task in ("cp3", "gyro")]
     content = collect(wanted, {job: report_of(wanted.cells[0], 0.5) for job in jobs}, seeds=2, quick=False)
@@ -229,9 +221,27 @@ def test_standard_errors_and_pictures(tmp_path):
     assert "of carom, first 20 steps" in markdown(content)
     write(content, tmp_path)
     drawn = pictures(tmp_path, tmp_path / "images")
-    assert [path.name for path in drawn] == ["errors_over_time.png", "energy_over_time.png"]
+    assert [path.name for path in drawn] == ["errors_over_time.png", "energy_over_time.png", "contact_properties.png"]
     assert all(path.stat().st_size > 10_000 for path in drawn)
     assert "images/energy_over_time.png" in page(tmp_path)
+    assert "images/contact_properties.png" in page(tmp_path)
+
+
+def test_contact_properties_in_brief_are_the_largest_errors(tmp_path):
+    wanted = table("properties")
+    (bp5,) = [job for job in wanted.jobs(1) if (job.task, job.model, job.contact_model) == ("bp5", "clnn", "cm")]
+    report = report_of(wanted.cells[0], 0.5)
+    true = task("bp5")
+    report["learned"]["friction"] = [*np.asarray(true.friction) + 1e-6]
+    report["learned"]["restitution"] = [*np.asarray(true.restitution) + 1e-7]
+    report["learned"]["friction"][3] += 2e-5
+    report["learned"]["friction"][7] += 0.3  # which the data do not tell
+    report["identification"]["friction"][7] = {"standard_error": None}
+    content = collect(wanted, {bp5: report}, seeds=1, quick=False)
+    assert "| bp5 | 60 | 2e-05 (3e-01), 1e-07 |" in brief(content)
+    assert len([line for line in brief(content).splitlines() if line.startswith("|")]) == 3
+    write(content, tmp_path)
+    assert brief(content) in page(tmp_path)
 
 
 def test_noise_of_pendulums_is_on_angles_and_rates():

@@ -21,7 +21,7 @@ class Reproduce:
     """Learn what a table of the paper's supplement needs, measure it, and write results/TABLE.json and TABLE.md.
 
     Finished trainings, and those that the written table has already, are skipped; stopped ones go on. `all`: every
-    table; `page`: docs/results.md from what there is, and the pictures of figure3.
+    table; `page`: docs/results.md from what there is, and its pictures.
     """
 
     table: Annotated[
@@ -50,7 +50,7 @@ class Reproduce:
 
     def run(self) -> None:
         """Do it."""
-        from carom.reproduction import results
+        from carom.reproduction import pages
         from carom.reproduction.tables import BUILDERS, table
 
         console = Console()
@@ -60,9 +60,9 @@ class Reproduce:
             from carom.atomic import check_writable, write_whole
 
             check_writable(self.page)
-            write_whole(self.page, results.page(self.results).encode())
+            write_whole(self.page, pages.page(self.results).encode())
             console.print(f"Written to {self.page}", soft_wrap=True, highlight=False)
-            for path in results.pictures(self.results, self.page.parent / "images"):
+            for path in pages.pictures(self.results, self.page.parent / "images"):
                 console.print(f"Drawn: {path}", soft_wrap=True, highlight=False)
             return
         names: list[Any] = list(BUILDERS) if self.table == "all" else [self.table]
@@ -76,7 +76,7 @@ class Reproduce:
             self._one(name, console)
 
     def _one(self, name: Any, console: Console) -> None:
-        from carom.reproduction import results
+        from carom.reproduction import pages, results
         from carom.reproduction.jobs import Job
         from carom.reproduction.tables import table
 
@@ -102,7 +102,7 @@ class Reproduce:
 
         def write() -> Path:
             content = results.collect(wanted, reports, seeds=seeds, quick=self.quick, earlier=earlier)
-            return results.write(content, into)
+            return pages.write(content, into)
 
         def keep(job: Job, report: dict[str, Any]) -> None:
             reports[job] = report

@@ -1,9 +1,8 @@
-"""From finished trainings to a table: `results/TABLE.json`, `results/TABLE.md`, and the page of all of them."""
+"""From finished trainings to the cells of a table, beside the paper's, and what a written table has already."""
 
 import dataclasses
 import functools
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,18 +11,19 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from carom.atomic import write_whole
 from carom.checks import require
 from carom.errors import CaromError
 from carom.reproduction.jobs import Job
-from carom.reproduction.tables import BUILDERS, EARLY_STEPS, Cell, Table
+from carom.reproduction.tables import Cell, Table
 from carom.tasks import find_task
 
 ZERO = 1e-4
 """A printed error of zero is met, and beaten, by one of at most this."""
 TIMES_BETTER = 3.0
-PICTURES = {"state": "errors_over_time.png", "energy": "energy_over_time.png"}
-"""Files of the pictures of errors over time."""
+OVER_TIME = ("state", "energy")
+"""Quantities whose errors over time are kept."""
+QUANTITIES = ("mu", "e")
+"""Contact properties, as columns name them: `gyro mu`, `bp5 e[3]`."""
 
 
 def deviation(cell: Cell, value: float) -> float:
@@ -200,7 +200,7 @@ def _curves(cell: Cell, report: dict[str, Any]) -> dict[str, dict[str, list[floa
     found = report["over_time"][cell.job.data]
     return {
         quantity: {name: [v and float(f"{v:.3g}") for v in values] for name, values in found[quantity].items()}
-        for quantity in PICTURES
+        for quantity in OVER_TIME
     }
 
 
@@ -211,6 +211,21 @@ def mean_over_seeds(curve: dict[str, Any], quantity: str) -> dict[str, Float[np.
     # Independent test sets: the variance of their mean.
     spread = np.sqrt(np.sum(half**2, axis=0)) / len(seeds)
     return {"mean": mean.mean(axis=0), "ci95": spread, "median": median.mean(axis=0)}
+
+
+def task_of(cell: dict[str, Any]) -> str:
+    """The task of a contact property's cell."""
+    return cell["column"].split()[0]
+
+
+def quantity_of(cell: dict[str, Any]) -> str:
+    """Which of `QUANTITIES` a contact property's cell is."""
+    return cell["column"].split()[1].partition("[")[0]
+
+
+def is_told(cell: dict[str, Any]) -> bool:
+    """Whether the data tell of a contact property: it has a standard error."""
+    return cell.get("standard_error") is not None
 
 
 def summary(cells: list[dict[str, Any]]) -> dict[str, int]:
@@ -239,148 +254,3 @@ def written(name: str, folder: Path) -> dict[str, Any] | None:
             f"{path} is not a table that carom wrote ({error}): restore it, or remove it to measure anew."
         ) from error
     return content
-
-
-def write(content: dict[str, Any], folder: Path) -> Path:
-    """Write `TABLE.json` and `TABLE.md` into the folder; returns the former's path."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{content['table']}.json"
-    text = json.dumps(content, indent=1, allow_nan=False)
-    lists_on_a_line = re.sub(r"\[[^][{}\"]*\]", lambda found: " ".join(found[0].split()), text)
-    write_whole(path, (lists_on_a_line + "\n").encode())
-    write_whole(path.with_suffix(".md"), markdown(content).encode())
-    return path
-
-
-def _number(value: float | None) -> str:
-    if value is None:
-        return ""
-    return f"{value:.2e}" if value and abs(value) < 1e-3 else f"{value:.5g}"
-
-
-def _with_interval(cell: dict[str, Any]) -> str:
-    number = _number(cell["carom"]) or _without_number(cell)
-    return number if cell["ci95"] is None else f"{number} ± {cell['ci95']:.0e}"
-
-
-def _without_number(cell: dict[str, Any]) -> str:
-    bounded = cell.get("bounded")
-    return cell["note"] if bounded is None else f"not finite (bounded: {_number(bounded)})"
-
-
-def markdown(content: dict[str, Any]) -> str:
-    """The table as a page's section: a line a cell, with the paper's number, ours, errors and their ratio."""
-    lines = [f"## {content['title']}", ""]
-    if content["quick"]:
-        lines += ["A smoke run (`--quick`): the numbers mean nothing.", ""]
-    columns: dict[str, Callable[[dict[str, Any]], str]] = {
-        "row": lambda cell: cell["row"],
-        "column": lambda cell: cell["column"],
-        "true": lambda cell: _number(cell["true"]),
-        "paper": lambda cell: _number(cell["paper"]),
-        "carom": _with_interval,
-        "standard error": lambda cell: _number(cell.get("standard_error")),
-        "error of the paper": lambda cell: _number(cell["paper_error"]),
-        "error of carom": lambda cell: _number(cell["error"]),
-        f"of carom, first {EARLY_STEPS} steps": lambda cell: _number(cell.get("early")),
-        "ratio": lambda cell: _number(cell["ratio"]),
-        "": lambda cell: (
-            cell["verdict"] if cell.get("counted", True) or not cell["verdict"] else f"({cell['verdict']})"
-        ),
-    }
-    rows = [{name: show(cell) for name, show in columns.items()} for cell in content["cells"]]
-    shown = [name for name in columns if any(row[name] for row in rows)]
-    lines += ["| " + " | ".join(shown) + " |", "|" + "---|" * len(shown)]
-    lines += ["| " + " | ".join(row[name] for name in shown) + " |" for row in rows]
-    counts = content["summary"]
-    if counts["compared"]:
-        lines += [
-            "",
-            f"{counts['met']} of {counts['compared']} cells are at least as good as the paper's, {counts['better']} at "
-            "least three times better.",
-        ]
-    if content["note"]:
-        lines += ["", content["note"]]
-    if content["runs"]:
-        commits = sorted({run["commit"] for run in content["runs"].values() if run.get("commit")})
-        count = len(content["runs"])
-        seconds = sum(run["seconds"] for run in content["runs"].values())
-        lines += [
-            "",
-            f"{count} training{'s' * (count != 1)} ({_seeds(content)}), {seconds / 60:.0f} minutes together; "
-            f"{'; '.join(sorted({run['machine'] for run in content['runs'].values() if 'machine' in run}))}"
-            + (f"; commit {', '.join(commits)}" if commits else "")
-            + f". `carom reproduce {content['table']}`.",
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _seeds(content: dict[str, Any]) -> str:
-    """Which seeds a table is of, and how many of its cells have fewer."""
-    cells = [set(cell["by_seed"]) for cell in content["cells"] if "by_seed" in cell]
-    every = set().union(*cells)
-    if every == {"0"}:
-        return "seed 0 alone"
-    fewer = sum(seeds != every for seeds in cells)
-    return f"seeds {', '.join(sorted(every, key=int))}" + (
-        f"; {fewer} of {len(cells)} cells have fewer" if fewer else ""
-    )
-
-
-def _worse(content: dict[str, Any]) -> list[str]:
-    """The cells of a table that count and are worse than the paper's, in a line."""
-    cells = [cell for cell in content["cells"] if cell["verdict"] == "worse" and cell.get("counted", True)]
-    if not cells:
-        return []
-    listed = "; ".join(
-        f"{cell['row']}, {cell['column']}: {_number(cell['error']) or cell['note']} "
-        f"(paper {_number(cell['paper_error'])})"
-        for cell in cells
-    )
-    return [f"* {content['title']}. {listed}."]
-
-
-def page(folder: Path) -> str:
-    """The page of all tables that the folder has."""
-    lines = [
-        "# The paper's tables, measured again",
-        "",
-        "Made by `carom reproduce`; numbers, seeds, times and settings are in `results/`. A property's error is its "
-        "distance to the true value (relative for mass ratios above one), that of a trajectory `|z - z^| / |z|` over "
-        "positions and velocities together, mean over time and 100 test trajectories, whose states have their own "
-        "seed. The mean is over seeds, after ± half of its 95 % interval (Student's t). A printed error of zero is "
-        f"met by one of at most {ZERO:g}. Paper: Zhong, Dey, Chakraborty, NeurIPS 2021, supplement.",
-        "",
-    ]
-    total = {"compared": 0, "met": 0, "better": 0}
-    parts, worse = [], []
-    for name in BUILDERS:
-        content = written(name, folder)
-        if content is not None:
-            parts.append(markdown(content))
-            if "over_time" in content:
-                parts.append("\n".join(f"![{file.removesuffix('.png')}](images/{file})" for file in PICTURES.values()))
-            total = {key: total[key] + content["summary"][key] for key in total}
-            worse += _worse(content)
-    lines += [
-        f"Of {total['compared']} cells that can be compared {total['met']} are at least as good as the paper's, and "
-        f"{total['better']} at least three times better.",
-        "",
-        *(
-            ["## Where carom is worse", "", "Errors; what they are due to stands below each table.", "", *worse, ""]
-            if worse
-            else []
-        ),
-    ]
-    return "\n".join([*lines, "\n".join(parts)])
-
-
-def pictures(folder: Path, images: Path) -> list[Path]:
-    """Draw errors over time, if the folder has `figure3`; returns the PNGs' paths."""
-    content = written("figure3", folder)
-    if content is None or "over_time" not in content:
-        return []
-    from carom.reproduction.figure import draw  # matplotlib is slow to import
-
-    images.mkdir(parents=True, exist_ok=True)
-    return [draw(content, quantity, images / name) for quantity, name in PICTURES.items()]
