@@ -284,8 +284,9 @@ def _s10() -> Table:
             note = "" if job else LATER
             cells.append(_error_cell(row, column, job, paper=float(value), note=note))
     note = (
-        f"{ROPE_NOTE} How many steps the paper's errors are of, it does not say: with seed 0 the baselines' of the first "
-        "20 are 1.2 to 1.5 times the paper's; with seed 1 some predictions of MLP-CD-CLNN are lost from step 18 on."
+        f"{ROPE_NOTE} How many steps the paper's errors are of, it does not say: with seed 0 the baselines' of the "
+        "first 20 are 1.2 to 1.5 times the paper's; with seed 1 some predictions of MLP-CD-CLNN are lost from "
+        "step 18 on."
     )
     return Table("s10", "S.10: number of points of the rope", tuple(cells), note)
 
