@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -22,6 +23,11 @@ from carom.mechanics.bodies import (
 )
 from carom.mechanics.constraints import Constraint, Rigid
 from carom.mechanics.potentials import NoPotential, Potential
+
+
+Compensation = Literal["mass", "paper"]
+"""How steps undo penetration, and whether contact that lasts acts over them: see docs/contact.md."""
+COMPENSATIONS = get_args(Compensation)
 
 
 class StepModel(eqx.Module):
@@ -49,7 +55,11 @@ class System(eqx.Module):
       to them by its `property` index; a single number is shared by all.
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
       candidates, or twice as many as points where that is less: more are an error, never dropped.
-    - `contact_model`: how closed contacts change the velocity: `"cm"`, `"cmr"`, `"lcp"`, or a `ContactModel`.
+    - `contact_model`: how closed contacts change the velocity: `"coulomb"`, `"cm"` (the paper's), `"cmr"`, `"lcp"`, or a
+      `ContactModel`.
+    - `compensation`: `"mass"`: contact that lasts acts over the whole step, and penetration is undone by moving bodies,
+      in the metric of the mass and without work. `"paper"`: contact acts at the end of a step, and penetration is undone
+      by a velocity (appendix G), as the paper's tasks have it.
     - `step_model`: a law for a whole step that replaces forces, constraints and the contact model; none by default.
     - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
     - `name`: the task's name, for a task's system.
@@ -68,6 +78,7 @@ class System(eqx.Module):
     restitution: Float[Array, " P"]
     contact_model: ContactModel
     step_model: StepModel | None
+    compensation: Compensation = eqx.field(static=True)
     dim: int = eqx.field(static=True)
     max_active: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
@@ -81,7 +92,8 @@ class System(eqx.Module):
         friction: ArrayLike | Sequence[float] = 0.0,
         restitution: ArrayLike | Sequence[float] = 0.0,
         *,
-        contact_model: str | ContactModel = "cm",
+        contact_model: str | ContactModel = "coulomb",
+        compensation: Compensation = "mass",
         step_model: StepModel | None = None,
         max_active: int | None = None,
         dim: int | None = None,
@@ -92,6 +104,7 @@ class System(eqx.Module):
         self.potential = NoPotential() if potential is None else potential
         self.contact_model = contact_model_of(contact_model)
         self.step_model = step_model
+        self.compensation = _compensation_of(compensation)
         self.dim = _dimension(self.bodies, self.contacts, self.potential, dim)
         table = self.table
         rigid = [
@@ -132,6 +145,13 @@ class System(eqx.Module):
         **Raises:** `CaromError` for an unknown one.
         """
         return self._with("contact_model", contact_model_of(contact_model))
+
+    def with_compensation(self, compensation: Compensation) -> "System":
+        """The same system with another way to undo penetration.
+
+        **Raises:** `CaromError` for an unknown one.
+        """
+        return self._with("compensation", _compensation_of(compensation))
 
     def _with(self, name: str, value) -> "System":
         new = object.__new__(System)
@@ -233,6 +253,12 @@ class System(eqx.Module):
     def travel(self) -> Float[Array, " C"]:
         """How much points may move while the gap of a candidate changes smoothly; see `Contact.travel`."""
         return jnp.concatenate([contact.travel(self.radii) for contact in self.contacts])
+
+
+def _compensation_of(compensation) -> Compensation:
+    known = ", ".join(map(repr, COMPENSATIONS))
+    require(compensation in COMPENSATIONS, f"compensation must be one of {known}; it was {compensation!r}.")
+    return compensation
 
 
 def _dimension(bodies, contacts, potential, dim) -> int:

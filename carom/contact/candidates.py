@@ -274,6 +274,7 @@ class Active(NamedTuple):
     gap: Float[Array, " K"]
     jacobian: Float[Array, "K d n d"]
     property_index: Int[Array, " K"]
+    index: Int[Array, " K"]  # which candidate each is
     closed: Bool[Array, " C"]  # which of all candidates these are
     overflow: Int[Array, ""]
 
@@ -300,6 +301,7 @@ def active_set(
         gap=candidates.gap[order],
         jacobian=jnp.einsum("kipj,kpn->kinj", rows, points),
         property_index=jnp.asarray(property_index)[order],
+        index=order,
         closed=jnp.zeros(closed.shape[0], bool).at[order].set(active),
         overflow=jnp.maximum(jnp.sum(closed) - max_active, 0),
     )

@@ -19,7 +19,8 @@ class ConeSettings(NamedTuple):
     """Knobs of the interior-point method; all are relative to the problem's own scale.
 
     `tolerance` is the largest residual of the optimality conditions (stationarity, complementarity) at which a problem
-    counts as solved. `target` is the residual at which its iterations stop. `diagonal` is delta / mean(diag A).
+    counts as solved. `target` is the residual at which its iterations stop. `diagonal` is delta: what each contact's own block gets, relative to
+    its A_nn.
     `smoothing` stops at that value of the complementarity products instead of at `target`, which smooths the
     derivative across the transitions between sticking, sliding and separating.
     """
@@ -263,7 +264,7 @@ class Scales(NamedTuple):
     mu: Float[Array, "K B"]
     size: Float[Array, "K B"]  # 1 / sqrt(A_nn): y_scaled * size * unit = (f_n, g_t)
     unit: Float[Array, " B"]
-    diagonal: Float[Array, " B"]  # delta
+    diagonal: Float[Array, "K B"]  # delta A_nn
     regularization: Float[Array, "K d B"]  # the diagonal that delta becomes in the scaled problem
     apex: Bool[Array, "K B"]  # contacts whose bound is zero
 
@@ -276,13 +277,12 @@ def scale(A: Array, v: Array, friction: Array, lower: Array, reference: Array, d
     normal = A[index, 0, index, 0]
     # A contact without inverse inertia is padding. It becomes: minimise f_n^2 / 2 + f_n, with the solution 0.
     present = normal > 0
-    mean = jnp.sum(jnp.where(present, normal, 0), axis=0) / jnp.maximum(jnp.sum(present, axis=0, dtype=dtype), 1)
-    diagonal = delta * mean
+    diagonal = jnp.asarray(delta * jnp.where(present, normal, 0))
     size = jnp.where(present, jax.lax.rsqrt(jnp.where(present, normal + diagonal, 1)), 0)
     S = size[:, None] * jnp.concatenate(
         [jnp.ones((k, 1, batch), dtype), jnp.broadcast_to(friction[:, None], (k, d - 1, batch))], axis=1
     )
-    regularization = S**2 * diagonal
+    regularization = S**2 * diagonal[:, None]
     # Rows that vanish (padding, tangents of frictionless contacts) get an own diagonal to be definite.
     floor = jnp.where(present[:, None], jnp.asarray(jnp.finfo(dtype).eps, dtype), 1)
     Q = S[:, :, None, None] * A * S[None, None]

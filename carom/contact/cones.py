@@ -41,8 +41,9 @@ from carom.contact.interior_point import interior_point
 #
 #     Q y + q = z + e_n w,    s o z = 0,    u w = 0,    s, z in the cone,  u, w >= 0
 #
-# Where A is singular the impulse is not unique. A diagonal delta I added to A (before the scaling, so that the norm
-# is that of the impulse itself) selects the solution of least norm as delta -> 0.
+# Where A is singular the impulse is not unique. A diagonal delta A_nn, added to each contact's own block, selects the
+# solution of least norm as delta -> 0: sum_i A_nn,i |f_i|^2, an energy, which knows neither the frame nor the units of
+# the contacts (bends in N m s beside stretches in N s), and in which contacts far apart do not meet.
 #
 # Two ways lead to the solution: Newton steps onto an active set that Gauss-Seidel shows (`active_set.py`), and where
 # that fails the central path (`interior_point.py`), whose end is such a step too. The matrix is the same.
@@ -69,7 +70,7 @@ class _Sensitivity(NamedTuple):
     triangle: Float[Array, "B n n"]  # L
     frame: Float[Array, "B K d d"]
     bound: Float[Array, "B K"]  # D
-    diagonal: Float[Array, " B"]  # delta
+    diagonal: Float[Array, "B K"]  # delta A_nn
     sticks: Bool[Array, "B K"]  # contacts inside of their cone, so that z = 0
 
     @classmethod
@@ -78,7 +79,7 @@ class _Sensitivity(NamedTuple):
         zeros = jnp.zeros((batch, k, d), dtype)
         triangle = jnp.broadcast_to(jnp.eye(k * d, dtype=dtype), (batch, k * d, k * d))
         frame, sticks = jnp.zeros((batch, k, d, d), dtype), jnp.zeros((batch, k), bool)
-        return cls(zeros, zeros, triangle, frame, zeros[..., 0], zeros[:, 0, 0], sticks)
+        return cls(zeros, zeros, triangle, frame, zeros[..., 0], zeros[..., 0], sticks)
 
     def solve(self, rhs: Float[Array, "B K d"]) -> Float[Array, "B K d"]:
         """`(Q + W^-2 + D)^-1 rhs`; linear in `rhs`, in both modes."""
@@ -129,7 +130,7 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
         triangle=matrix.triangle(),
         frame=jnp.moveaxis(size[:, None] * matrix.frame, -1, 0),
         bound=(matrix.curvature / jnp.where(scales.size > 0, scales.size, jnp.inf) ** 2).T,
-        diagonal=scales.diagonal,
+        diagonal=scales.diagonal.T,
         sticks=matrix.sticks.T,
     )
 
@@ -313,7 +314,7 @@ def _impulse_jvp(settings, primals, tangents):
     dA, dv, dfriction, dlower, _ = tangents  # `reference` only sets a scale
     solution, out = _batched(settings, True)(*primals)
     f = _friction_scale(out.regular, friction)
-    after = _apply(A, f) + out.diagonal[:, None, None] * _friction_scale(out.moved, friction) + v
+    after = _apply(A, f) + out.diagonal[..., None] * _friction_scale(out.moved, friction) + v
     # What is left of z where a contact sticks is an error, which a singular A would multiply by 1 / delta.
     after = jnp.asarray(jnp.where((out.sticks & (friction > 0))[..., None], 0, after))
     # Where mu = 0 the tangent g is not determined by the problem, and z is the apex of its cone. For a growing mu,
@@ -327,7 +328,7 @@ def _impulse_jvp(settings, primals, tangents):
     boundary = jnp.where(frictionless, norm * dfriction[..., None], 0)
     dSy = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * g], axis=-1)
     dS_after = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * tangent], axis=-1)
-    force = _apply(dA, f) + dv + _apply(A, dSy) + out.diagonal[:, None, None] * dSy
+    force = _apply(dA, f) + dv + _apply(A, dSy) + out.diagonal[..., None] * dSy
     rhs = -(dS_after + _friction_scale(force, friction))
     rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None] + boundary, rhs[..., 1:]], axis=-1)
     df = dSy + _friction_scale(out.solve(rhs), friction)
@@ -365,7 +366,7 @@ def solve_cone_problem(
     relative to the problem's scale. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
     A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is
-    the one of least norm, but for degenerate problems that only the proximal rounds solve: of these it is one near it.
+    the one of least norm, each contact weighted by its own mobility `A_nn`, but for degenerate problems that only the proximal rounds solve: of these it is one near it.
     The iterations run in double precision where that is enabled, whatever the dtype of the data. Differentiable once,
     in forward and reverse mode.
 

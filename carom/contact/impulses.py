@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from carom.checks import as_floats, require, require_values
 from carom.contact.candidates import Active
@@ -27,6 +27,8 @@ class ContactState(NamedTuple):
     target: Float[Array, "K d"]  # v_C*, see `target_velocity`
     friction: Float[Array, " K"]
     restitution: Float[Array, " K"]
+    reference: Float[Array, "K d"] | None = None  # velocities beside which others are rounding, if not `velocity`
+    rebounds: Bool[Array, ""] | bool = True  # if not, nothing is asked for after compression: contacts that last
 
 
 class Jump(NamedTuple):
@@ -52,7 +54,7 @@ class CM(ContactModel):
     """Friction cones and Poisson's restitution in two phases, with the Delassus matrix as it is (S.12 to S.15)."""
 
     def __call__(self, state, *, smoothing=0.0):
-        return _two_phase_jump(state, smoothing)
+        return _phases_jump(state, smoothing)
 
 
 class CMr(ContactModel):
@@ -81,18 +83,15 @@ class CMr(ContactModel):
         d = state.velocity.shape[1]
         # Padding has zero rows in A, by which the solver knows it, and keeps them.
         present = jnp.repeat(state.active.active, d)
-        return _two_phase_jump(state, smoothing, jnp.where(present, self.epsilon.astype(state.delassus.dtype), 0))
+        return _phases_jump(state, smoothing, jnp.where(present, self.epsilon.astype(state.delassus.dtype), 0))
 
 
 class Coulomb(ContactModel):
-    """Coulomb's friction with Poisson's restitution: CM without the lift of contacts that slide.
+    """Coulomb's friction with Poisson's restitution, exactly: CM without the lift of contacts that slide.
 
-    The convex programs of CM make a contact that slides with `v_t` separate with `v_n = mu |v_t|` (they ask for
-    velocities in the dual cone), as if it bounced. With `mu |v_t|` of the solution added to the normal velocity that a
-    program starts from, its solution is that of Coulomb's law with `v_n >= 0` (G. De Saxce, Z.-Q. Feng 1998; V. Acary,
-    F. Cadoux, C. Lemarechal, J. Malick 2011). `iterations` programs are solved in turn for it, the speeds `|v_t|` by
-    secants: the third has the solution for one contact that goes on sliding in its direction, whatever mu; where
-    contacts act on each other or turn, each further one takes most of the error away.
+    The convex programs of CM make a contact that slides separate with `v_n = mu |v_t|` (they ask for velocities in the
+    dual cone), as if it bounced. Here each phase obeys Signorini's condition and Coulomb's law themselves, a nonlinear
+    complementarity problem that is solved as such (`carom/contact/coulomb.py`).
 
     Friction and restitution may be less in faster impacts, with the contact's speed of approach `v_n` (m/s):
 
@@ -102,22 +101,21 @@ class Coulomb(ContactModel):
     impacts (W. Goldsmith, *Impact*, 1960).
 
     **Arguments:** `friction_loss`, `restitution_loss`, from 0 to 1, and `loss_speed` (m/s), positive: leaves of the
-    pytree, which can be learned; `iterations`.
+    pytree, which can be learned.
 
-    **Raises:** `CaromError` for values that are out of range or not one number, and for less than one iteration.
+    **Raises:** `CaromError` for values that are out of range or not one number, and if a `smoothing` is asked for: this
+    model has none.
     """
 
     friction_loss: Float[Array, ""]
     restitution_loss: Float[Array, ""]
     loss_speed: Float[Array, ""]
-    iterations: int = eqx.field(static=True)
 
     def __init__(
         self,
         friction_loss: ArrayLike = 0.0,
         restitution_loss: ArrayLike = 0.0,
         loss_speed: ArrayLike = 0.3,
-        iterations: int = 4,
     ):
         self.friction_loss, self.restitution_loss = as_floats(friction_loss), as_floats(restitution_loss)
         self.loss_speed = as_floats(loss_speed)
@@ -127,16 +125,15 @@ class Coulomb(ContactModel):
             speed = name == "loss_speed"
             good = (value > 0) & jnp.isfinite(value) if speed else (value >= 0) & (value <= 1)
             require_values(name, value, good, "a positive speed in m/s" if speed else "a share from 0 to 1")
-        require(iterations >= 1, f"iterations must be at least 1; it was {iterations}.")
-        self.iterations = iterations
 
     def __call__(self, state, *, smoothing=0.0):
+        require(smoothing == 0, f"smoothing must be 0 with the contact model Coulomb; it was {smoothing}.")
         lost = 1 - jnp.exp(-jnp.maximum(-state.velocity[:, 0], 0) / self.loss_speed)
         at_speed = state._replace(
             friction=state.friction * (1 - self.friction_loss * lost),
             restitution=state.restitution * (1 - self.restitution_loss * lost),
         )
-        return _two_phase_jump(at_speed, smoothing, sliding=self.iterations)
+        return _phases_jump(at_speed, smoothing, coulomb=True)
 
 
 class LCP(ContactModel):
@@ -160,7 +157,7 @@ class LCP(ContactModel):
 
     def __call__(self, state, *, smoothing=0.0):
         require(smoothing == 0, f"smoothing must be 0 with the contact model LCP; it was {smoothing}.")
-        bounce = -state.restitution * jnp.minimum(state.velocity[:, 0], 0)
+        bounce = -state.restitution * jnp.minimum(state.velocity[:, 0], 0) * state.rebounds
         target = state.target[:, 0]
         # Where both are equal, as at e = 0 without compensation, the derivative is that of the bounce, for a growing e.
         rebound = jnp.where(bounce >= target, bounce, target)
@@ -199,10 +196,10 @@ def contact_model_settings(model: ContactModel) -> dict[str, Any]:
     return {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.metadata.get("static", False)}
 
 
-def _two_phase_jump(
-    state: ContactState, smoothing: float, diagonal: Float[Array, " r"] | None = None, sliding: int = 0
+def _phases_jump(
+    state: ContactState, smoothing: float, diagonal: Float[Array, " r"] | None = None, coulomb: bool = False
 ) -> Jump:
-    compression, rebound = two_phases(
+    phases = two_phases(
         state.delassus,
         state.velocity,
         state.friction,
@@ -210,11 +207,13 @@ def _two_phase_jump(
         state.target,
         diagonal=diagonal,
         smoothing=smoothing,
-        sliding=sliding,
+        coulomb=coulomb,
+        reference=state.reference,
+        rebounds=state.rebounds,
     )
-    residual = jnp.maximum(compression.residual, rebound.residual)
-    velocity = _velocity_jump(state, compression.impulse + rebound.impulse)
-    return Jump(velocity, residual, jnp.stack([compression.impulse, rebound.impulse]))
+    impulse = jnp.stack([phase.impulse for phase in phases])
+    residual = jnp.maximum(*(phase.residual for phase in phases))
+    return Jump(_velocity_jump(state, jnp.sum(impulse, axis=0)), residual, impulse)
 
 
 def _velocity_jump(state: ContactState, impulse: Float[Array, "K d"]) -> Float[Array, "n d"]:
@@ -242,11 +241,11 @@ def target_velocity(
     depth = jax.lax.stop_gradient(depth)
     desired = jnp.zeros((k, d), JC.dtype).at[:, 0].set(depth / time).reshape(-1)
     gram = JC @ JC.T
-    v = JC.T @ _solve_regular(gram, desired, _vanishing(gram))
+    v = JC.T @ _solve_regular(gram, desired, _vanishing(gram, d))
     closed = jnp.sum(jnp.any(JC.reshape(k, -1) != 0, axis=1))
     target = jnp.where(closed * d > JC.shape[1], JC @ v, desired)
     if JE.shape[0]:
-        target = target - JC @ (JE.T @ _solve_regular(JE @ JE.T, JE @ v, 0.0))
+        target = target - JC @ (JE.T @ _solve_regular(JE @ JE.T, JE @ v, jnp.zeros(JE.shape[0], JE.dtype)))
     return target.reshape(k, d)
 
 
@@ -269,18 +268,18 @@ def consistent_velocity(
     )
     row = scale.reshape(-1)
     matrix = row[:, None] * delassus * row
-    delta = _vanishing(matrix)
-    unreachable = delta * _solve_regular(matrix, row * drift.reshape(-1), delta).reshape(scale.shape)
+    delta = _vanishing(matrix, velocity.shape[1])
+    unreachable = (delta * _solve_regular(matrix, row * drift.reshape(-1), delta)).reshape(scale.shape)
     return velocity - jnp.where(scale > 0, unreachable / jnp.where(scale > 0, scale, 1), 0)
 
 
-def _vanishing(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
-    """A diagonal in place of the limit of none: 4e-10 of the matrix in double precision, 7e-5 in single."""
-    return jnp.finfo(matrix.dtype).eps ** 0.6 * jnp.max(jnp.diag(matrix))
+def _vanishing(matrix: Float[Array, "r r"], d: int) -> Float[Array, " r"]:
+    """A diagonal in place of the limit of none: 4e-10 of each contact's normal entry in double precision, 7e-5 in single."""
+    return jnp.finfo(matrix.dtype).eps ** 0.6 * jnp.repeat(jnp.diag(matrix)[::d], d)
 
 
 def _solve_regular(matrix, rhs, diagonal):
-    """`(matrix + diagonal)^-1 rhs`; a matrix of zeros counts as the identity."""
-    diagonal = jnp.where(jnp.max(jnp.diag(matrix)) > 0, diagonal, 1)
-    matrix = matrix + diagonal * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    """`(matrix + diagonal)^-1 rhs`; rows of zeros count as those of the identity."""
+    diagonal = jnp.where(diagonal > 0, diagonal, jnp.where(jnp.diag(matrix) > 0, 0, 1))
+    matrix = matrix + jnp.diag(diagonal)
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)

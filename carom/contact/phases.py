@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from carom.checks import is_known, require, require_values
-from carom.contact.cones import ConeSettings, ConeSolution, solve_cone_problem
+from carom.contact.cones import ConeSettings, solve_cone_problem
+from carom.contact.coulomb import solve_coulomb_problem
 
 
 def solve_impulse(
@@ -67,14 +68,34 @@ def contact_impulse(
     return compression.impulse, rebound.impulse
 
 
+class Phase(NamedTuple):
+    """Impulses (N s) of one phase of an impact, and by how much they miss its law, relative to the problem's scale."""
+
+    impulse: Float[Array, "*b K d"]
+    residual: Float[Array, "*b"]
+
+
 def two_phases(
-    A, v, friction, restitution, v_star, *, diagonal: Array | None = None, smoothing: float = 0.0, sliding: int = 0
-) -> tuple[ConeSolution, ConeSolution]:
+    A,
+    v,
+    friction,
+    restitution,
+    v_star,
+    *,
+    diagonal: Array | None = None,
+    smoothing: float = 0.0,
+    coulomb: bool = False,
+    reference: Array | None = None,
+    rebounds: Bool[Array, ""] | bool = True,
+) -> tuple[Phase, Phase]:
     """`contact_impulse` without its checks, with the solver's residuals.
 
     `diagonal` (..., K d) is added to that of A in the convex programs alone, not where velocities are computed.
-    `sliding` programs in each phase undo the lift of contacts that slide (see `Coulomb`); 0: CM, which has it.
+    `coulomb`: each phase obeys Coulomb's law, in place of the convex programs (see `Coulomb`). `reference` (..., K, d):
+    velocities (m/s) beside which others are rounding; `v` itself by default. Where it does not rebound, the second phase
+    is nothing, and costs nothing.
     """
+    reference = v if reference is None else reference
     program = A if diagonal is None else A + diagonal[..., None] * jnp.eye(A.shape[-1], dtype=A.dtype)
 
     # The phases differ in their data alone, so that they are one compiled solve, done twice.
@@ -82,24 +103,9 @@ def two_phases(
         velocity, lower = state
         velocity = velocity - jnp.where(is_rebound, v_star, 0)
         least = jnp.where(is_rebound, lower, -jnp.inf)
-
-        def solved(start):
-            solution = _solve(program, start, friction, least, smoothing, reference=v)
-            return (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape), solution
-
-        def without_lift(search, _):
-            speed = _next_speed(search)
-            change, solution = solved(velocity.at[..., 0].add(friction * speed))
-            excess = _length((velocity + change)[..., 1:]) - speed
-            return _Search(speed, excess, search.speed, search.excess), (change, solution)
-
-        if sliding:
-            speed = _length(velocity[..., 1:])
-            start = _Search(speed, jnp.zeros_like(speed), speed, jnp.zeros_like(speed))
-            _, found = jax.lax.scan(without_lift, start, length=sliding)
-            change, solution = jax.tree.map(lambda s: s[-1], found)
-        else:
-            change, solution = solved(velocity)
+        matrix = jnp.where(is_rebound & ~jnp.asarray(rebounds), 0, program)  # zeros are no contacts
+        solution = _solve(matrix, velocity, friction, least, smoothing, reference=reference, coulomb=coulomb)
+        change = (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
         return (velocity + change, lower), solution
 
@@ -107,46 +113,19 @@ def two_phases(
     return jax.tree.map(lambda s: s[0], solutions), jax.tree.map(lambda s: s[1], solutions)
 
 
-class _Search(NamedTuple):
-    """Speeds of sliding (..., K) that the last program was given and the one before, and how much more came out."""
-
-    speed: Float[Array, "*b K"]
-    excess: Float[Array, "*b K"]
-    speed_before: Float[Array, "*b K"]
-    excess_before: Float[Array, "*b K"]
-
-
-def _next_speed(search: _Search) -> Float[Array, "*b K"]:
-    """The speed of sliding to try next, for each contact where the excess would be zero if it were linear (secants).
-
-    It is linear for one contact that goes on sliding in its direction: the third program is then given the solution,
-    and has its derivative. Where there is no slope yet, the speed that came out.
-    """
-    plain = search.speed + search.excess
-    step, slope = search.speed - search.speed_before, search.excess - search.excess_before
-    usable = (jnp.abs(step) > 1e-12 * search.speed) & (jnp.abs(slope) > 0.1 * jnp.abs(step))
-    secant = search.speed - search.excess * step / jnp.where(usable, slope, 1)
-    return jnp.where(usable, jnp.clip(secant, 0, 3 * jnp.maximum(search.speed, plain)), plain)
-
-
-def _length(vector: Float[Array, "*b d"]) -> Float[Array, "*b"]:
-    """Length, with a derivative of zero at zero."""
-    square = jnp.sum(vector**2, axis=-1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-
-
-def _solve(A, v, friction, lower, smoothing, reference=None) -> ConeSolution:
+def _solve(A, v, friction, lower, smoothing, reference=None, coulomb: bool = False) -> Phase:
     batch = v.shape[:-2]
 
     def flat(x: Array, rank: int) -> Array:
         return x.reshape(-1, *x.shape[x.ndim - rank :])
 
-    out = solve_cone_problem(
-        *(flat(A, 2), flat(v, 2), flat(friction, 1), flat(lower, 1)),
-        reference=None if reference is None else flat(reference, 2),
-        smoothing=smoothing,
-    )
-    return ConeSolution(out.impulse.reshape(v.shape), out.residual.reshape(batch), out.iterations.reshape(batch))
+    arrays = (flat(A, 2), flat(v, 2), flat(friction, 1), flat(lower, 1))
+    reference = None if reference is None else flat(reference, 2)
+    if coulomb:
+        out = solve_coulomb_problem(*arrays, reference=reference)
+    else:
+        out = solve_cone_problem(*arrays, reference=reference, smoothing=smoothing)
+    return Phase(out.impulse.reshape(v.shape), out.residual.reshape(batch))
 
 
 def _check_problem(A, v, *, friction, **others):
@@ -168,7 +147,7 @@ def _check_problem(A, v, *, friction, **others):
             require_values(name, value, value >= 0, "at least 0")
 
 
-def _check_solved(solution: ConeSolution, dtype):
+def _check_solved(solution: Phase, dtype):
     if is_known(solution.residual):
         worst = float(jnp.max(solution.residual, initial=0))
         tolerance = 100 * ConeSettings.for_dtype(dtype).tolerance

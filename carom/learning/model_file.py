@@ -126,7 +126,9 @@ def _contact_model(path: str | Path, header: dict[str, Any]) -> ContactModel | N
         name in CONTACT_MODELS,
         f"the model {path} was learned with the contact model {name!r}, which this version of carom does not have.",
     )
-    return CONTACT_MODELS[name](**settings)
+    # A model of an older version may have settings that there are no more: how many programs were solved for Coulomb.
+    known = contact_model_settings(CONTACT_MODELS[name]())
+    return CONTACT_MODELS[name](**{key: value for key, value in settings.items() if key in known})
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes]:

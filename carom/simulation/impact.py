@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import require
+from carom.contact.energy import dissipative
 from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
@@ -22,6 +23,10 @@ IMPACT_RULES = get_args(ImpactRule)
 
 COMPENSATION_STEPS = 8.0
 """Time steps over which a penetration is undone, by default (paper, appendix G)."""
+
+
+MAX_EVENTS = 24
+"""Times at which a step is cut at most, by default, by the rule of events."""
 
 
 def check_compensation_steps(steps: float | None) -> None:
@@ -53,7 +58,7 @@ class Stepper(eqx.Module):
     contact: bool = eqx.field(static=True, default=True)
     consistent: bool = eqx.field(static=True, default=False)
     impact: ImpactRule = eqx.field(static=True, default="step")
-    events: int = eqx.field(static=True, default=2)  # most impacts that a step is cut at, where `impact` is "event"
+    events: int = eqx.field(static=True, default=MAX_EVENTS)  # most impacts that a step is cut at, where `impact` is "event"
 
 
 class StepResult(eqx.Module):
@@ -67,34 +72,47 @@ class StepResult(eqx.Module):
 
 
 def smooth_flow(system: System, stepper: Stepper, inverse_mass: Float[Array, "n n"], force=None):
-    """The motion between impacts, as two functions of a state `(x, v)`: its rate, and the state after a time (s)."""
+    """The motion between impacts, as two functions of a state `(x, v)`: its rate, and the state after a time (s).
+
+    Both take the forces of contacts that last, if any: (C, d) in N, in the frame of each candidate (normal first).
+    """
     field = FIELDS[stepper.formulation]
 
-    def rate(state):
+    def rate(state, pressing=None):
         x, v = state
         total = -jax.grad(system.potential_energy)(x)
         if force is not None:
             total = total + force
+        if pressing is not None:
+            total = total + contact_force(system, x, pressing)
         return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
 
-    def after(state, time):
-        x, v = flow(stepper.solver, rate, state, time)
+    def after(state, time, pressing=None):
+        x, v = flow(stepper.solver, lambda state: rate(state, pressing), state, time)
         return project_state(system.constraints, x, v, inverse_mass) if stepper.project else (x, v)
 
     return rate, after
 
 
-def contact_jump(
+def contact_force(system: System, x: Float[Array, "n d"], pressing: Float[Array, "C d"]) -> Float[Array, "n d"]:
+    """What forces `pressing` (N) of the candidates, each in its frame, are on the points at `x`: `J_C^T pressing`."""
+    candidates = system.candidates(x)
+    share = jnp.einsum("cipj,ci->cpj", candidates.rows, pressing)
+    return jnp.zeros_like(x).at[candidates.stencil].add(share)
+
+
+def closed_contacts(
     system: System,
     x: Float[Array, "n d"],
     v: Float[Array, "n d"],
     inverse_mass: Float[Array, "n n"],
     stepper: Stepper,
     closed: Bool[Array, " C"] | None = None,
-) -> tuple[ContactState, Jump]:
-    """The contacts that are closed at `x`, and how they change the velocity (S.8 to S.15).
+) -> ContactState:
+    """The contacts that are closed at `x`, and all that a contact model may know of them (S.8 to S.13).
 
-    `closed`: which these are, if not those whose gap is negative.
+    `closed`: which these are, if not those whose gap is negative. Their target velocity is that of the paper's rule if
+    the system compensates penetration so, and none otherwise.
     """
     active = system.active(x, closed)
     k, d = active.jacobian.shape[:2]
@@ -115,12 +133,11 @@ def contact_jump(
         drift = jnp.einsum("rid,id->r", rows, v - saddle.project(v[None])[0]).reshape(k, d)
         velocity = consistent_velocity(velocity, drift, delassus, friction)
     v_star = jnp.zeros_like(velocity)
-    if stepper.compensation_steps is not None:
+    if stepper.compensation_steps is not None and system.compensation == "paper":
         joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
         depth = jnp.where(active.active, jnp.maximum(-active.gap, 0), 0)
-        time = stepper.dt * stepper.compensation_steps.astype(stepper.dt.dtype)
-        v_star = target_velocity(active.jacobian, depth, joints, time=time)
-    contacts = ContactState(
+        v_star = target_velocity(active.jacobian, depth, joints, time=stepper.dt * compensation_steps_of(stepper))
+    return ContactState(
         x=x,
         v=v,
         active=active,
@@ -131,7 +148,30 @@ def contact_jump(
         friction=friction,
         restitution=system.restitution[active.property_index],
     )
-    return contacts, system.contact_model(contacts, smoothing=stepper.smoothing)
+
+
+def compensation_steps_of(stepper: Stepper) -> Float[Array, ""]:
+    """The steps over which penetration is undone, in the precision of the time step."""
+    require(stepper.compensation_steps is not None, "compensation_steps must be a number here; it was None.")
+    return jnp.asarray(stepper.compensation_steps, stepper.dt.dtype)
+
+
+def contact_jump(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+    closed: Bool[Array, " C"] | None = None,
+) -> tuple[ContactState, Jump]:
+    """The contacts that are closed at `x`, and how an impact there changes the velocity (S.8 to S.15).
+
+    `closed`: which these are, if not those whose gap is negative. An impact adds no energy, but for the target velocity
+    of the paper's rule.
+    """
+    contacts = closed_contacts(system, x, v, inverse_mass, stepper, closed)
+    jump = system.contact_model(contacts, smoothing=stepper.smoothing)
+    return contacts, jump if system.compensation == "paper" else dissipative(contacts, jump)
 
 
 def _held(
@@ -155,6 +195,15 @@ def _held(
     both = jnp.asarray(moves[:, None] & moves)
     rows, response = (jnp.asarray(jnp.where(moves[:, None, None], part, 0)) for part in (rows, response))
     return rows, response, jnp.asarray(jnp.where(both, delassus, 0))
+
+
+def has_impulses(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper) -> bool:
+    """Whether the contact model tells the impulses of contacts: one that does not cannot hold contacts that last."""
+
+    def impulses(x, v):
+        return contact_jump(system, x, v, system.inverse_mass_matrix(), stepper)[1].impulse
+
+    return jax.eval_shape(impulses, x, v) is not None
 
 
 def impact_at(

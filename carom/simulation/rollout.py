@@ -10,18 +10,20 @@ from jaxtyping import Array, Bool, Float, Int
 from carom.checks import as_floats, is_known, require, require_values
 from carom.contact.impulses import ContactModel
 from carom.mechanics.dynamics import FIELDS, Formulation
-from carom.simulation.events import step_with_events
 from carom.simulation.impact import (
     COMPENSATION_STEPS,
+    MAX_EVENTS,
     IMPACT_RULES,
     ImpactRule,
     Stepper,
     StepResult,
     check_compensation_steps,
+    has_impulses,
     impact_at,
     smooth_flow,
 )
 from carom.simulation.integrators import RK4
+from carom.simulation.segments import step_in_segments
 from carom.system import System
 
 
@@ -42,9 +44,10 @@ class Trajectory(eqx.Module):
 
 
 def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None) -> StepResult:
-    """Integrate one whole step, then let the contacts act that are closed at its end (the paper's rule).
+    """One step of `stepper.dt`: contact that lasts acts over it, and impacts happen (see `carom.simulation.segments`).
 
-    With events, cut the step at the times at which contacts close (see `carom.simulation.events`).
+    By the paper's rule, and where a contact model has no impulses (a network), the whole step is integrated, and then
+    the contacts act that are closed at its end.
 
     A system with a `step_model` is moved by that alone.
     """
@@ -58,9 +61,9 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
     if not stepper.contact or not system.contacts:
         x, v = after((x, v), stepper.dt)
         return StepResult(x, v, jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
-    if stepper.impact == "event":
-        return step_with_events(system, x, v, inverse_mass, stepper, (rate, after))
-    return impact_at(system, *after((x, v), stepper.dt), inverse_mass, stepper)
+    if stepper.impact == "step" and (system.compensation == "paper" or not has_impulses(system, x, v, stepper)):
+        return impact_at(system, *after((x, v), stepper.dt), inverse_mass, stepper)
+    return step_in_segments(system, x, v, inverse_mass, stepper, (rate, after))
 
 
 def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) -> Trajectory:
@@ -103,7 +106,7 @@ def simulate(
     dt: float | Float[Array, ""],
     steps: int,
     impact: ImpactRule = "step",
-    max_events: int = 2,
+    max_events: int = MAX_EVENTS,
     project: bool = True,
     force: Float[Array, "*b steps n d"] | None = None,
     formulation: Formulation = "lagrangian",

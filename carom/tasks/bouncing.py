@@ -42,6 +42,8 @@ class BouncingPoints(Task):
             contacts=box_contacts(len(self.masses), individual=len(self.contact_friction) > 1),
             friction=np.array(self.contact_friction),
             restitution=np.array(self.contact_restitution),
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

@@ -38,6 +38,8 @@ class Cube(Task):
             potential=Gravity((0.0, 0.0, -self.gravity)),
             friction=self.contact_friction,
             restitution=self.contact_restitution,
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

@@ -40,6 +40,8 @@ class BouncingDisks(Task):
             potential=Gravity((0.0, -self.gravity)) if self.gravity else None,
             friction=np.array(self.contact_friction),
             restitution=np.array(self.contact_restitution),
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 
@@ -81,6 +83,8 @@ class Billiards(Task):
             friction=0.0,
             restitution=self.contact_restitution,
             dim=2,
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

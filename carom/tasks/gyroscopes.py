@@ -61,6 +61,8 @@ class Gyroscope(Task):
             potential=Gravity((0.0, 0.0, -GRAVITY)),
             friction=self.contact_friction,
             restitution=self.contact_restitution,
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

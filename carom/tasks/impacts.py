@@ -44,6 +44,8 @@ class Impacts(Task):
             friction=0.0,
             restitution=self.contact_restitution,
             dim=2,
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

@@ -59,6 +59,8 @@ class ChainedPendulum(Task):
             potential=Gravity((0.0, -GRAVITY)),
             friction=self.contact_friction,
             restitution=self.contact_restitution,
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

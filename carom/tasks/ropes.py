@@ -41,6 +41,8 @@ class Rope(Task):
             friction=self.contact_friction,
             restitution=self.contact_restitution,
             max_active=2 * self.points - 1,
+            contact_model="cm",
+            compensation="paper",
             name=self.name,
         )
 

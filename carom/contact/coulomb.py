@@ -1,0 +1,442 @@
+r"""Coulomb's law, exactly: the nonlinear complementarity problem of contacts with friction. Arrays only.
+
+The problem, for each of a batch of `B` independent sets of `K` contacts in `d` = 2 or 3 dimensions, with `u = A f + v`
+the velocities after the impact (normal first), for every contact:
+
+    f_n >= lower,   u_n >= 0,   (f_n - lower) u_n = 0                       Signorini's condition (`lower` = 0)
+    |f_t| <= mu f_n,   and where u_t is not zero   f_t = -mu f_n u_t / |u_t|     Coulomb's
+
+It is the cone problem of `cones.py` with De Saxce's correction `u + mu |u_t| e_n` in place of `u` (G. De Saxce, Z.-Q.
+Feng 1998; V. Acary, F. Cadoux, C. Lemarechal, J. Malick 2011), and no convex program. See `solve_coulomb_problem`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
+
+# --- The method -------------------------------------------------------------------------------------------------
+#
+# Each contact is scaled by 1 / sqrt(A_nn), the whole problem by its largest velocity. With projections in place of
+# inequalities (P. Alart, A. Curnier, A mixed formulation for frictional contact problems, 1991) the law is H(y) = 0,
+#
+#     H_n = y_n - max(lower, y_n - u_n)
+#     H_t = y_t - proj(y_t - rho u_t, disc of radius mu max(lower, y_n - u_n)),    rho = 1 / (largest eigenvalue of A_tt)
+#
+# semi-smooth: sweeps of projected Gauss-Seidel come near to the solution, Newton steps onto the modes that are seen
+# there (open or held by the bound, sticking, sliding) end in it. Where they do not, more sweeps and more steps follow.
+#
+# Where A is singular the impulse is not unique. A diagonal `delta A_nn` on each contact's own block selects that of
+# least norm, each contact weighted by its own mobility: a norm (an energy) that knows no frame and no unit. A last step
+# takes its effect on the velocities away.
+
+_DELTA = 1e-9
+_SOLVED = 1e-10
+"""Residual at which a problem counts as solved; that of a problem in single precision is larger by the ratio of eps."""
+_CONVERGED = 1e-12
+"""Newton steps go on until no |H| is larger."""
+_SWEEPS = 24
+_STEPS = 10
+_ROUNDS = 7
+"""Further rounds where the first tries fail, each with twice the sweeps of the one before."""
+_LENGTHS = (1.0, 0.5, 0.2, 0.05)
+"""Shares of a Newton step that are tried."""
+_NEAR_APEX = 1e-5
+"""An impulse nearer to zero than this is at it, for the derivative by a bound of zero."""
+BLOCK = {6: 128, 24: 64}
+"""Problems solved together, by the most rows that one has (more rows: 32)."""
+
+
+class CoulombSolution(NamedTuple):
+    """Impulses `f` (N s), and by how much they miss the law, relative to each problem's own scale.
+
+    The residual is infinite where the data were not finite, which makes the impulse NaN.
+    """
+
+    impulse: Float[Array, "B K d"]
+    residual: Float[Array, " B"]
+
+
+class _Problem(NamedTuple):
+    """A batch of scaled problems, batch last."""
+
+    Q: Float[Array, "n n B"]
+    q: Float[Array, "K d B"]
+    mu: Float[Array, "K B"]
+    lower: Float[Array, "K B"]
+    rho: Float[Array, "K B"]
+    present: Bool[Array, "K B"]
+
+
+class _Modes(NamedTuple):
+    """How the law looks near an impulse: which rows say what. `H` and its derivative, both by `u` and `y`."""
+
+    H: Float[Array, "K d B"]
+    closes: Bool[Array, "K B"]  # u_n = 0, and not f_n = lower
+    sticks: Bool[Array, "K B"]
+    along: Float[Array, "K t B"]  # direction of y_t - rho u_t
+    share: Float[Array, "K B"]  # radius / |y_t - rho u_t| of those that slide
+    radius: Float[Array, "K B"]  # of the disc, per unit of mu
+
+
+def _matvec(Q: Array, y: Array) -> Array:
+    return jnp.sum(Q * y.reshape(1, -1, y.shape[-1]), axis=1).reshape(y.shape)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.sum(a * b, axis=1)
+
+
+def _modes(problem: _Problem, y: Float[Array, "K d B"], u: Float[Array, "K d B"], apex: Array | bool = False) -> _Modes:
+    """Modes at `y` with the velocities `u`; contacts in `apex` are held by their bound where `y` is next to zero."""
+    trial = y[:, 0] - u[:, 0]
+    closes = (trial > problem.lower) & ~(apex & (y[:, 0] < _NEAR_APEX))
+    pressed = jnp.where(closes, trial, problem.lower)
+    radius = problem.mu * pressed
+    push = y[:, 1:] - problem.rho[:, None] * u[:, 1:]
+    length = jnp.sqrt(_dot(push, push))
+    sticks = (length <= radius) & (radius > 0)
+    safe = jnp.where(length > 0, length, 1)
+    along = push / safe[:, None]
+    share = jnp.where(sticks, 1.0, radius / safe)
+    normal = jnp.where(closes, u[:, 0], y[:, 0] - problem.lower)
+    tangent = jnp.where(sticks[:, None], problem.rho[:, None] * u[:, 1:], y[:, 1:] - radius[:, None] * along)
+    H = jnp.concatenate([normal[:, None], tangent], axis=1)
+    return _Modes(jnp.asarray(H), closes, sticks, along, jnp.asarray(share), pressed)
+
+
+def _by_velocity(problem: _Problem, modes: _Modes, du: Float[Array, "K d m B"]) -> Float[Array, "K d m B"]:
+    """`dH/du du`."""
+    along, share = modes.along[:, :, None], modes.share[:, None, None]
+    slides = ~modes.sticks
+    normal = jnp.where(modes.closes[:, None], du[:, 0], 0)
+    tangent = problem.rho[:, None, None] * du[:, 1:]
+    across = tangent - along * jnp.sum(along * tangent, axis=1, keepdims=True)
+    narrower = (problem.mu * modes.closes)[:, None, None] * along * du[:, :1]
+    sliding = share * across + narrower
+    tangent = jnp.where(slides[:, None, None], sliding, tangent)
+    return jnp.concatenate([normal[:, None], tangent], axis=1)
+
+
+def _by_impulse(problem: _Problem, modes: _Modes) -> Float[Array, "K d d B"]:
+    """`dH/dy` of each contact at given velocities."""
+    k, t, batch = modes.along.shape
+    along, share = modes.along, modes.share
+    eye = jnp.eye(t, dtype=along.dtype)[None, :, :, None]
+    across = eye - along[:, :, None] * along[:, None]
+    tangent = jnp.where(modes.sticks[:, None, None], 0, eye - share[:, None, None] * across)
+    narrower = jnp.where(modes.sticks | ~modes.closes, 0, problem.mu)[:, None] * along
+    first = jnp.where(modes.closes, 0, 1).astype(along.dtype)
+    top = jnp.concatenate([first[:, None, None], jnp.zeros((k, 1, t, batch), along.dtype)], axis=2)
+    return jnp.concatenate([top, jnp.concatenate([-narrower[:, :, None], tangent], axis=2)], axis=1)
+
+
+def _jacobian(problem: _Problem, modes: _Modes) -> Float[Array, "B n n"]:
+    """`dH/dy + dH/du Q`."""
+    k, d, batch = problem.q.shape
+    whole = _by_velocity(problem, modes, problem.Q.reshape(k, d, k * d, batch)).reshape(k, d, k, d, batch)
+    index = jnp.arange(k)
+    whole = whole.at[index, :, index].add(_by_impulse(problem, modes))
+    return jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
+
+
+def _linear_solve(matrix: Float[Array, "B n n"], rhs: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
+    flat = jnp.moveaxis(rhs.reshape(-1, rhs.shape[-1]), -1, 0)[..., None]
+    return jnp.moveaxis(jnp.linalg.solve(matrix, flat)[..., 0], 0, -1).reshape(rhs.shape)
+
+
+def _softened(problem: _Problem) -> _Problem:
+    n = problem.Q.shape[0]
+    return problem._replace(Q=problem.Q + _DELTA * jnp.eye(n, dtype=problem.Q.dtype)[..., None])
+
+
+def _residual(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, " B"]:
+    """Largest |H|: impulses relative to the largest, velocities to the largest term of `Q y + q`.
+
+    Unlike `H` of the modes it is that of the projections, which no mode can hide: an impulse outside of its cone counts.
+    """
+    u = _matvec(problem.Q, y) + problem.q
+    modes = _modes(problem, y, u)
+    impulse = jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
+    velocity = jnp.maximum(jnp.max(_matvec(jnp.abs(problem.Q), jnp.abs(y)), axis=(0, 1)), 1)
+    scale = jnp.where(modes.closes, velocity, impulse)
+    tangent = jnp.where(modes.sticks, velocity, impulse)
+    parts = jnp.concatenate([jnp.abs(modes.H[:, :1]) / scale[:, None], jnp.abs(modes.H[:, 1:]) / tangent[:, None]], 1)
+    # What keeps to its bound or its cone by H alone may still be pushed through it.
+    approach = jnp.where(problem.present, jnp.maximum(-u[:, 0], 0), 0) / velocity
+    outside = jnp.sqrt(_dot(y[:, 1:], y[:, 1:])) - problem.mu * jnp.maximum(y[:, 0], 0)
+    beyond = jnp.maximum(jnp.maximum(outside, problem.lower - y[:, 0]), 0) / impulse
+    worst = jnp.max(jnp.concatenate([parts, approach[:, None], beyond[:, None]], axis=1), axis=(0, 1))
+    return jnp.where(jnp.isfinite(worst), worst, jnp.inf)
+
+
+# --- Sweeps and steps -------------------------------------------------------------------------------------------
+
+
+def _sweep(problem: _Problem, y: Float[Array, "K d B"], sweeps) -> Float[Array, "K d B"]:
+    """Projected Gauss-Seidel: each contact in turn meets the law as far as one step along its own block does."""
+    k, d, batch = problem.q.shape
+    rows = problem.Q.reshape(k, d, k * d, batch)
+
+    def contact(i, y: Array) -> Array:
+        u = jnp.sum(rows[i] * y.reshape(1, k * d, batch), axis=1) + problem.q[i]
+        before = y[i]
+        normal = jnp.maximum(before[0] - u[0], problem.lower[i])
+        # The tangents see what the normal impulse has changed.
+        tangent = u[1:] + rows[i, 1:].reshape(d - 1, k, d, batch)[:, i, 0] * (normal - before[0])
+        moved = before[1:] - problem.rho[i] * tangent
+        length = jnp.sqrt(jnp.sum(moved**2, axis=0))
+        radius = problem.mu[i] * normal
+        moved = moved * jnp.where(length > radius, radius / jnp.where(length > 0, length, 1), 1)
+        return y.at[i].set(jnp.concatenate([normal[None], moved]))
+
+    def body(_, y: Array) -> Array:
+        return jax.lax.fori_loop(0, k, contact, y, unroll=k <= 4)
+
+    return jax.lax.fori_loop(0, sweeps, body, y)
+
+
+def _newton(problem: _Problem, y: Float[Array, "K d B"], steps: int) -> Float[Array, "K d B"]:
+    """Newton steps from `y`, each as long as makes `|H|` least of some lengths; the best impulse on the way."""
+
+    def merit(y):
+        u = _matvec(problem.Q, y) + problem.q
+        H = _modes(problem, y, u).H
+        return jnp.max(jnp.abs(H), axis=(0, 1))
+
+    class _Path(NamedTuple):
+        y: Array
+        best: Array
+        least: Array
+        step: Array
+
+    def keep_going(path: _Path):
+        return (path.step < steps) & jnp.any(path.least > _CONVERGED)
+
+    def body(path: _Path) -> _Path:
+        y = path.y
+        u = _matvec(problem.Q, y) + problem.q
+        modes = _modes(problem, y, u)
+        change = _linear_solve(_jacobian(problem, modes), -modes.H)
+        change = jnp.where(jnp.isfinite(change), change, 0)
+        tried = jnp.stack([y + s * change for s in _LENGTHS])
+        merits = jax.vmap(merit)(tried)
+        chosen = jnp.argmin(jnp.where(jnp.isnan(merits), jnp.inf, merits), axis=0)
+        index = jnp.arange(y.shape[-1])
+        y, value = jnp.moveaxis(tried[chosen, :, :, index], 0, -1), merits[chosen, index]
+        better = value < path.least
+        return _Path(y, jnp.where(better, y, path.best), jnp.where(better, value, path.least), path.step + 1)
+
+    start = _Path(y, y, merit(y), jnp.asarray(0))
+    return jax.lax.while_loop(keep_going, body, start).best
+
+
+def _polish(problem: _Problem, soft: _Problem, y: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
+    """`y` less what the diagonal has changed of the velocities, if that meets the law better."""
+
+    def improve(_, y):
+        modes = _modes(problem, y, _matvec(problem.Q, y) + problem.q)
+        moved = y + _linear_solve(_jacobian(soft, modes), -modes.H)
+        return jnp.where(_residual(problem, moved) < _residual(problem, y), moved, y)
+
+    return jax.lax.fori_loop(0, 2, improve, y)
+
+
+def _scale(A: Array, v: Array, friction: Array, lower: Array, reference: Array):
+    """Batch first to a scaled problem, batch last; also what turns its impulses into physical ones, and velocities."""
+    batch, k, d = v.shape
+    A = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
+    index = jnp.arange(k)
+    normal = A[index, 0, index, 0]
+    present = normal > 0
+    size = jnp.where(present, jax.lax.rsqrt(jnp.where(present, normal, 1)), 0)
+    Q = size[:, None, None, None] * A * size[None, None, :, None]
+    v, reference = jnp.moveaxis(v, 0, -1), jnp.moveaxis(reference, 0, -1)
+    q = size[:, None] * v
+    # Padding becomes: u_n = y_n + 1, with the solution 0.
+    Q = Q.at[index, 0, index, 0].add(jnp.where(present, 0, 1))
+    lower = jnp.where(present & (lower.T > 0), lower.T / jnp.where(present, size, 1), 0)
+    largest = jnp.maximum(jnp.max(jnp.abs(q), axis=(0, 1)), jnp.max(lower, axis=0))
+    largest = jnp.maximum(largest, jnp.max(jnp.abs(size[:, None] * reference), axis=(0, 1)))
+    unit = jnp.maximum(largest, jnp.finfo(v.dtype).tiny ** 0.5)
+    q = jnp.where(present[:, None], q / unit, jnp.zeros_like(q).at[:, 0].set(1))
+    own = jnp.abs(Q[index, 1:, index, 1:])
+    stiff = jnp.max(jnp.sum(own, axis=2), axis=1)
+    rho = jnp.where(stiff > 0, 1 / jnp.where(stiff > 0, stiff, 1), 1)
+    return _Problem(Q.reshape(k * d, k * d, batch), q, friction.T, lower / unit, rho, present), size, unit
+
+
+class _Sensitivity(NamedTuple):
+    """What the derivative needs, batch first and in physical units: `df = -inverse (by_u (dA f + dv) + ...)`."""
+
+    matrix: Float[Array, "B n n"]  # dH/dy, which is solved with
+    by_velocity: Float[Array, "B K d d"]  # dH/du of each contact
+    by_friction: Float[Array, "B K d"]  # dH/dmu
+    by_bound: Float[Array, "B K d"]  # dH/dlower
+    size: Float[Array, "B K"]
+
+    @classmethod
+    def nothing(cls, batch: int, k: int, d: int, dtype) -> "_Sensitivity":
+        """That of problems without contacts."""
+        eye = jnp.broadcast_to(jnp.eye(k * d, dtype=dtype), (batch, k * d, k * d))
+        zeros = jnp.zeros((batch, k, d), dtype)
+        return cls(eye, jnp.zeros((batch, k, d, d), dtype), zeros, zeros, zeros[..., 0])
+
+
+def _sensitivity(problem: _Problem, y: Array, bounded: Array, size: Array, unit: Array) -> _Sensitivity:
+    k, d, batch = y.shape
+    soft = _softened(problem)
+    u = _matvec(soft.Q, y) + problem.q
+    # A bound of zero holds wherever the impulse is next to zero: the derivative is the one-sided one for a growing
+    # bound, whichever side rounding has put the velocity on.
+    modes = _modes(soft, y, u, bounded & (problem.lower == 0))
+    eye = jnp.broadcast_to(jnp.eye(d, dtype=y.dtype)[None, :, :, None], (k, d, d, batch))
+    by_velocity = _by_velocity(soft, modes, eye)
+    slides = ~modes.sticks
+    by_friction = jnp.where(slides[:, None], -modes.radius[:, None] * modes.along, 0)
+    by_friction = jnp.concatenate([jnp.zeros_like(by_friction[:, :1]), by_friction], axis=1)
+    held = jnp.where(modes.closes, 0, 1).astype(y.dtype)
+    by_bound = jnp.where((slides & ~modes.closes)[:, None], -problem.mu[:, None] * modes.along, 0)
+    by_bound = jnp.concatenate([-held[:, None], by_bound], axis=1)
+    return _Sensitivity(
+        matrix=_jacobian(soft, modes),
+        by_velocity=jnp.moveaxis(by_velocity * size[:, None, None], -1, 0),
+        by_friction=jnp.moveaxis(by_friction * unit, -1, 0),
+        by_bound=jnp.moveaxis(by_bound / jnp.where(size > 0, size, 1)[:, None], -1, 0),
+        size=size.T,
+    )
+
+
+def _solve_block(A, v, friction, lower, reference, *, sensitivity: bool, first: bool):
+    """Solve one block of problems, batch first in and out; the `first` try, or all that is tried after it."""
+    finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction).all(1)
+    finite = finite & (lower < jnp.inf).all(1)
+    A = jnp.where(finite[:, None, None], A, 0)
+    v = jnp.where(finite[:, None, None], v, 0)
+    friction = jnp.where(finite[:, None], friction, 0)
+    problem, size, unit = _scale(A, v, friction, jnp.where(finite[:, None], lower, 0), reference)
+    soft = _softened(problem)
+
+    def attempt(y, sweeps):
+        y = _polish(problem, soft, _newton(soft, _sweep(soft, y, sweeps), _STEPS))
+        return y, _residual(problem, y)
+
+    zero = jnp.zeros_like(problem.q)
+    if first:
+        y, residual = attempt(zero, _SWEEPS)
+    else:
+
+        class _Search(NamedTuple):
+            swept: Array
+            y: Array
+            residual: Array
+            round: Array
+
+        def keep_going(search: _Search):
+            return (search.round < _ROUNDS) & jnp.any(search.residual > _SOLVED)
+
+        def body(search: _Search) -> _Search:
+            swept = _sweep(soft, search.swept, 2 * _SWEEPS * 2**search.round)
+            y, residual = attempt(swept, 0)
+            better = (residual < search.residual) & (search.residual > _SOLVED)
+            y = jnp.where(better, y, search.y)
+            return _Search(swept, y, jnp.where(better, residual, search.residual), search.round + 1)
+
+        start = _Search(zero, zero, jnp.full(v.shape[0], jnp.inf, v.dtype), jnp.asarray(0))
+        _, y, residual, _ = jax.lax.while_loop(keep_going, body, start)
+    nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
+    solution = CoulombSolution(
+        jnp.moveaxis(y * size[:, None] * unit + nan, -1, 0), jnp.where(finite, residual, jnp.inf)
+    )
+    if not sensitivity:
+        return solution, None
+    return solution, _sensitivity(problem, y, (lower >= 0).T, size, unit)
+
+
+def _solve_batch(A, v, friction, lower, reference, *, sensitivity: bool):
+    """Solve a batch block by block: problems without a contact cost nothing, those with few only their own room."""
+    batch, k, d = v.shape
+    used = contacts_used(A, k)
+    solution = CoulombSolution(
+        impulse=jnp.zeros((batch, k, d), v.dtype), residual=jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
+    )
+    out = (solution, _Sensitivity.nothing(batch, k, d, v.dtype) if sensitivity else None)
+    forms = [(True, *form) for form in by_size(used, k)]
+    forms.append((False, k, used > 0))
+    for first, size, chosen in forms:
+        m = size * d
+        arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
+        missing = chosen & ~(out[0].residual <= _SOLVED)
+        solve = functools.partial(_solve_block, sensitivity=sensitivity, first=first)
+        block = next((size for most, size in BLOCK.items() if m <= most), 32)
+        out = solve_chosen(solve, arrays, missing, block, out)
+    return out
+
+
+@functools.cache
+def _batched(sensitivity: bool):
+    """`_solve_batch`, whose batching under vmap is one larger batch."""
+    return as_one_batch(functools.partial(_solve_batch, sensitivity=sensitivity), "solver of Coulomb's law")
+
+
+def _apply(A, x):
+    """`A x` for `x` as (B, K, d)."""
+    return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
+
+
+@jax.custom_jvp
+def _impulse(A, v, friction, lower, reference) -> CoulombSolution:
+    return _batched(False)(A, v, friction, lower, reference)[0]
+
+
+# The derivative. H(y; A, v, mu, lower) = 0 at the solution, with the modes that are there, gives
+#
+#     (dH/dy + dH/du A) df = -( dH/du (dA f + dv) + dH/dmu dmu + dH/dlower dlower )
+#
+# The matrix is that of the last Newton step, in scaled impulses. Everything on the right is linear in the tangents, so
+# that both modes, vmap and jit follow from this rule.
+@_impulse.defjvp
+def _impulse_jvp(primals, tangents):
+    A, *_ = primals
+    dA, dv, dfriction, dlower, _ = tangents  # `reference` only sets a scale
+    solution, out = _batched(True)(*primals)
+    f = solution.impulse
+    change = _apply(dA, f) + dv
+    rhs = jnp.einsum("bkij,bkj->bki", out.by_velocity, change)
+    rhs = rhs + out.by_friction * dfriction[..., None] + out.by_bound * dlower[..., None]
+    batch, k, d = f.shape
+    y = jnp.linalg.solve(out.matrix, -rhs.reshape(batch, k * d, 1)).reshape(f.shape)
+    return solution, CoulombSolution(y * out.size[..., None], jnp.zeros_like(solution.residual))
+
+
+def solve_coulomb_problem(
+    A: Float[Array, "B n n"],
+    v: Float[Array, "B K d"],
+    friction: Float[Array, "B K"],
+    lower: Float[Array, "B K"] | None = None,
+    *,
+    reference: Float[Array, "B K d"] | None = None,
+) -> CoulombSolution:
+    """Impulses that obey Coulomb's law and Signorini's condition, for a batch of problems.
+
+    **Arguments:** `A` (B, K d, K d), symmetric positive semi-definite, velocity per impulse (1 / kg); `v` (B, K, d),
+    velocities of the contact points, normal first (m/s); `friction` (B, K), mu >= 0; `lower` (B, K), least normal
+    impulses (N s), >= 0, or `None` for zero; `reference` (B, K, d), velocities (m/s) that `v` is what remains of, if
+    so: what is small beside them is rounding. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
+
+    A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is the
+    one of least norm, each contact weighted by its own mobility. Differentiable once, in forward and reverse mode.
+
+    **Source:** Alart and Curnier 1991; Acary and Brogliato, *Numerical Methods for Nonsmooth Dynamical Systems*, 2008.
+    """
+    dtype = v.dtype
+    widest = jnp.zeros((), float).dtype
+    work = widest if widest.itemsize > dtype.itemsize else dtype
+    lower = jnp.full_like(friction, -jnp.inf) if lower is None else lower
+    reference = jnp.zeros_like(v) if reference is None else jax.lax.stop_gradient(reference)
+    out = _impulse(*(x.astype(work) for x in (A, v, friction, lower, reference)))
+    return CoulombSolution(out.impulse.astype(dtype), out.residual.astype(dtype))

@@ -1,0 +1,295 @@
+"""Steps with contact that lasts: a step as one or more segments, each from one impact to the next.
+
+A contact that is closed over a segment acts over it, not at its end. At the start of a segment the contacts that touch
+and stay are found, with the constant forces, each in the contact's own frame, by which their law holds at its end to
+first order. The motion is integrated under them. At the end the law is met by what is still missing of their impulses,
+impacts happen, and penetration is undone.
+
+What rests is held: where the forces cancel the others, the state is a fixed point of the step, to rounding. Where forces
+are constant (sliding, rolling on a plane) the motion is exact, else of second order in the time step.
+
+By the rule `"step"` a step is one segment, and contacts that close within it act at its end. By `"event"` it is cut at
+the times at which contacts close.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from carom.contact.batching import anywhere
+from carom.contact.energy import dissipative, islands
+from carom.contact.impulses import ContactState, Jump
+from carom.contact.penetration import pushes
+from carom.simulation.events import may_close, next_event, own_times, to_event
+from carom.simulation.impact import Stepper, StepResult, closed_contacts, compensation_steps_of
+from carom.simulation.projection import project_state
+from carom.system import System
+
+State = tuple[Float[Array, "n d"], Float[Array, "n d"]]
+
+_NEAR = 1e-3
+"""A gap that is less than this share of what the accelerations could close within the segment counts as closed."""
+_CLOSING = 0.5
+"""Closed contacts that approach faster than this share of what the accelerations give within the segment are hit."""
+_RETURNS = 0.01
+"""By the rule of events, contacts that leave slower than this share rest: more are events of their own. The share grows
+with the events of the step, so that a ball that comes to rest does so after finitely many."""
+
+
+class _Progress(NamedTuple):
+    """How far a step has come."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    left: Float[Array, ""]  # s until its end
+    acted: Bool[Array, " C"]  # contacts that have acted at this state
+    contact: Bool[Array, ""]
+    overflow: Int[Array, ""]
+    residual: Float[Array, ""]
+    missed: Bool[Array, ""]
+
+
+class _Segment(NamedTuple):
+    """A state at an end of a segment, and what is known of the contacts there."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    time: Float[Array, ""]  # s since the start
+    pressing: Float[Array, "C d"]  # N, of contacts that last, each in its frame
+    lasts: Bool[Array, " C"]
+    closed: Bool[Array, " C"]
+    again: Bool[Array, ""]  # the step has been cut here: there is more of it
+    contact: Bool[Array, ""]
+    overflow: Int[Array, ""]
+    residual: Float[Array, ""]
+
+
+def step_in_segments(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    inverse_mass: Float[Array, "n n"],
+    stepper: Stepper,
+    motion: tuple[Callable, Callable],
+) -> StepResult:
+    """One step with contact; `motion` is that of `smooth_flow`."""
+    no, zero = jnp.asarray(False), jnp.zeros((), x.dtype)
+    none = jnp.zeros(system.n_candidates, bool)
+    start = _Progress(x, v, stepper.dt, none, no, jnp.asarray(0), zero, no)
+    segment = _Stepping(system, inverse_mass, stepper, motion)
+    if stepper.impact == "step":
+        return _result(segment(start, jnp.asarray(0)))
+
+    def part(now: _Progress, count):
+        goes_on = now.left > 0
+
+        def go_on():
+            new = segment(now, count)
+            return jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), new, now)
+
+        return jax.lax.cond(anywhere(goes_on), go_on, lambda: now), None
+
+    def with_contact():
+        # What a segment computes is computed again for the derivative: kept, it would be that of all segments that a step
+        # may have, of which most have one.
+        end, _ = jax.lax.scan(jax.checkpoint(part), start, jnp.arange(stepper.events + 1))
+        return _result(end)
+
+    _, after = motion
+    end = after((x, v), stepper.dt)
+    near = may_close(segment.still, *jax.lax.stop_gradient(((x, v), end)), stepper.dt)
+
+    def alone():
+        return StepResult(end[0], end[1], no, jnp.asarray(0), zero)
+
+    return jax.lax.cond(anywhere(near), with_contact, alone)
+
+
+def _result(end: _Progress) -> StepResult:
+    # A step that would need more events than it may have is not solved.
+    residual = jnp.where(end.missed, jnp.inf, end.residual)
+    return StepResult(end.x, end.v, end.contact, end.overflow, residual)
+
+
+class _Stepping:
+    """One segment of a step: what does not change from one to the next."""
+
+    def __init__(self, system: System, inverse_mass, stepper: Stepper, motion: tuple[Callable, Callable]):
+        self.system, self.inverse_mass, self.stepper = system, inverse_mass, stepper
+        self.rate, self.after = motion
+        # Nothing in the search for events is differentiated, the system's own geometry included.
+        self.still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
+
+    def __call__(self, now: _Progress, count: Int[Array, ""]) -> _Progress:
+        """From `now` to the next event, or to the end of the step."""
+        zero = jnp.zeros_like(now.left)
+        forces = jnp.zeros((self.system.n_candidates, self.system.dim), now.x.dtype)
+        none = jnp.zeros_like(now.acted)
+        no = jnp.asarray(False)
+        start = _Segment(now.x, now.v, zero, forces, none, none, no, no, now.overflow, now.residual)
+
+        # Both ends are one program, run twice: most of it is the solver.
+        def end_of(state: _Segment, first: Bool[Array, ""]):
+            state, change = jax.lax.cond(
+                first,
+                lambda: self.touching(state, now.left, count),
+                lambda: (state, jnp.zeros_like(state.pressing)),
+            )
+            state, held = self.act(state, change, first)
+            return jax.lax.cond(first, lambda: self.move(state, held, now, count), lambda: state), None
+
+        end, _ = jax.lax.scan(end_of, start, jnp.array([True, False]))
+        return _Progress(
+            x=end.x,
+            v=end.v,
+            left=jnp.where(end.again, now.left - end.time, 0),
+            acted=end.closed,
+            contact=now.contact | end.contact,
+            overflow=end.overflow,
+            residual=end.residual,
+            missed=now.missed | (end.again & (count == self.stepper.events)),
+        )
+
+    def touching(
+        self, state: _Segment, left: Float[Array, ""], count: Int[Array, ""]
+    ) -> tuple[_Segment, Float[Array, "C d"]]:
+        """Which contacts are closed and stay so, and how fast all contacts' velocities change without them (m/s^2)."""
+        motion = self.rate((state.x, state.v))
+
+        def seen(x, v):
+            candidates = self.system.candidates(x)
+            return jnp.einsum("cipj,cpj->ci", candidates.rows, v[candidates.stencil]), candidates
+
+        (velocity, candidates), (change, _) = jax.jvp(seen, (state.x, state.v), motion)
+        # What the accelerations of the points can give a contact: no direction and no cancellation is in it.
+        push = jnp.linalg.norm(motion[1], axis=-1)[candidates.stencil]
+        gain = left * jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * push, axis=1)
+        leaves = 1.0 if self.stepper.impact == "step" else jnp.minimum(_RETURNS * 2.0 ** (count / 2), 1.0)
+        normal = velocity[:, 0]
+        closed = candidates.gap <= _NEAR * left * gain
+        lasts = jax.lax.stop_gradient(closed & (normal >= -_CLOSING * gain) & (normal <= leaves * gain))
+        return state._replace(lasts=lasts, closed=lasts), change * left
+
+    def act(
+        self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""]
+    ) -> tuple[_Segment, Float[Array, "C d"]]:
+        """Let contacts act at an end of a segment: those that last are held, the others hit.
+
+        At the first end nothing is changed: what is found is the impulses (N s) that contacts which last will need by the
+        other, if their velocities change by `change` (m/s) without them.
+        """
+        system, stepper = self.system, self.stepper
+        contacts = closed_contacts(system, state.x, state.v, self.inverse_mass, stepper, state.closed)
+        index, active = contacts.active.index, contacts.active.active
+        k, d = contacts.velocity.shape
+        held = state.lasts[index] & active
+        past = jnp.where(held[:, None], state.time * state.pressing[index], 0)
+        before = contacts.velocity + jnp.where(first, change[index], 0)
+        free = before - (contacts.delassus @ past.reshape(-1)).reshape(k, d)
+        if stepper.compensation_steps is not None:
+            # A gap that is left may close, in as many steps as a penetration is undone in.
+            room = jnp.maximum(contacts.active.gap, 0) / (stepper.dt * compensation_steps_of(stepper))
+            free = free.at[:, 0].add(jnp.where(held, room, 0))
+        together = islands(contacts.delassus, d)
+        reference = jnp.maximum(jnp.abs(free), jnp.abs(before))
+
+        class Acting(NamedTuple):
+            velocity: Float[Array, "K d"]  # of the contacts
+            change: Float[Array, "K d"]  # impulses by which the state's velocity changes
+
+        def part(acting: Acting, hits: Bool[Array, ""]):
+            hit = active & ~held & (acting.velocity[:, 0] < 0) & ~first
+            these = jnp.where(hits, active & jnp.any(together & hit, axis=1), held)
+            problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, hits)
+            jump = dissipative(problem, system.contact_model(problem, smoothing=stepper.smoothing))
+            impulse = _total(jump)
+            impulse = impulse - jnp.where(hits, 0, past)
+            velocity = acting.velocity + (contacts.delassus @ impulse.reshape(-1)).reshape(k, d)
+            return Acting(velocity, acting.change + impulse), jump
+
+        acting, jumps = jax.lax.scan(part, Acting(before, jnp.zeros_like(past)), jnp.array([False, True]))
+        hit_jump = jax.tree.map(lambda a: a[1], jumps)
+        wanted = jnp.zeros_like(state.pressing).at[index].add(jnp.where(held[:, None], acting.change, 0))
+        kick = jnp.einsum("rid,r->id", contacts.response, acting.change.reshape(-1))
+        new = state._replace(
+            overflow=jnp.maximum(state.overflow, contacts.active.overflow),
+            residual=jnp.maximum(state.residual, jnp.max(jumps.residual)),
+        )
+        rest = jax.lax.cond(
+            first,
+            lambda: (new.x, new.v, new.contact),
+            lambda: (*self.after_impact(new, contacts, hit_jump, kick, acting.velocity), jnp.any(active)),
+        )
+        return new._replace(x=rest[0], v=rest[1], contact=rest[2]), wanted
+
+    def after_impact(self, state: _Segment, contacts: ContactState, jump: Jump, kick, velocity) -> State:
+        """The state with its velocity changed, and with penetration undone as far as this segment does."""
+        stepper = self.stepper
+        x, v = state.x, state.v + kick
+        if stepper.impact == "event":
+            x = x - own_times(contacts, jump, stepper.dt)
+        if stepper.compensation_steps is None:
+            return x, v
+        d = velocity.shape[1]
+        depth = jnp.where(contacts.active.active, jnp.maximum(-contacts.active.gap, 0), 0)
+        share = jnp.minimum(state.time / (stepper.dt * compensation_steps_of(stepper)), 1)
+        # What leaves by itself is not pushed: that would be work.
+        wanted = jnp.maximum(share * depth - jnp.maximum(velocity[:, 0], 0) * state.time, 0)
+        push = pushes(contacts.delassus[::d, ::d], wanted)
+        x = x + jnp.einsum("kid,k->id", contacts.response[::d], push)
+        return project_state(self.system.constraints, x, v, self.inverse_mass) if stepper.project else (x, v)
+
+    def move(
+        self, state: _Segment, impulse: Float[Array, "C d"], now: _Progress, count: Int[Array, ""]
+    ) -> _Segment:
+        """From the start of a segment, where contacts that last want an `impulse` (N s), to its other end."""
+        left = now.left
+        pressing = impulse / jnp.where(left > 0, left, 1)
+        begin = (state.x, state.v)
+        end = self.after(begin, left, pressing)
+        if self.stepper.impact == "step":
+            time, again = left, jnp.asarray(False)
+            closed = jax.lax.stop_gradient(self.system.gaps(end[0])) < 0
+        else:
+            still = jax.lax.stop_gradient((begin, end, left))
+            event = next_event(self.still, *still, now.acted | state.lasts)
+
+            def rate(state):
+                return self.rate(state, pressing)
+
+            def after(state, time):
+                return self.after(state, time, pressing)
+
+            met, time, closed, again = to_event(begin, left, event, self.system, (rate, after))
+            end = jax.tree.map(lambda a, b: jnp.where(again, a, b), met, end)
+            time = jnp.where(again, time, left)
+            closed = jnp.where(again, closed, jax.lax.stop_gradient(self.system.gaps(end[0])) < 0)
+        return state._replace(
+            x=end[0], v=end[1], time=time, pressing=pressing, closed=closed | state.lasts, again=again
+        )
+
+
+def _only(contacts: ContactState, these: Bool[Array, " K"], velocity, reference, rebounds) -> ContactState:
+    """The problem of `these` contacts alone, with their velocities."""
+    d = velocity.shape[1]
+    rows = jnp.repeat(these, d)
+    return contacts._replace(
+        active=contacts.active._replace(active=contacts.active.active & these),
+        delassus=jnp.where(rows[:, None] & rows, contacts.delassus, 0),
+        velocity=jnp.where(these[:, None], velocity, 0),
+        target=jnp.zeros_like(velocity),
+        restitution=jnp.where(rebounds, contacts.restitution, 0),
+        reference=jnp.where(these[:, None], reference, 0),
+        rebounds=rebounds,
+    )
+
+
+def _total(jump: Jump) -> Float[Array, "K d"]:
+    """The impulses of all phases together."""
+    if jump.impulse is None:
+        raise AssertionError("a contact model without impulses does not come here")
+    return jnp.sum(jump.impulse, axis=0)
