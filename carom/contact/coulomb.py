@@ -116,7 +116,7 @@ def _by_velocity(problem: _Problem, modes: _Modes, du: Float[Array, "K d m B"]) 
     normal = jnp.where(modes.closes[:, None], du[:, 0], 0)
     tangent = problem.rho[:, None, None] * du[:, 1:]
     across = tangent - along * jnp.sum(along * tangent, axis=1, keepdims=True)
-    narrower = (problem.mu * modes.closes)[:, None, None] * along * du[:, :1]
+    narrower = jnp.where(modes.closes, problem.mu, 0)[:, None, None] * along * du[:, :1]
     sliding = share * across + narrower
     tangent = jnp.where(slides[:, None, None], sliding, tangent)
     return jnp.concatenate([normal[:, None], tangent], axis=1)

@@ -35,9 +35,11 @@ _NEAR = 1e-3
 """A gap that is less than this share of what the accelerations could close within the segment counts as closed."""
 _CLOSING = 0.5
 """Closed contacts that approach faster than this share of what the accelerations give within the segment are hit."""
-_RETURNS = 0.01
-"""By the rule of events, contacts that leave slower than this share rest: more are events of their own. The share grows
-with the events of the step, so that a ball that comes to rest does so after finitely many."""
+_LEAVING = 1e-3
+"""Closed contacts that leave faster than this share leave; those that do not stay."""
+_REBOUNDS = {"step": 1.0, "event": 0.05}
+"""An impact from which a contact would leave slower than this share of what the accelerations take back within a step has
+no rebound. By the rule of events it grows with the events of the step: what comes to rest does so after finitely many."""
 
 
 class _Progress(NamedTuple):
@@ -62,6 +64,7 @@ class _Segment(NamedTuple):
     pressing: Float[Array, "C d"]  # N, of contacts that last, each in its frame
     lasts: Bool[Array, " C"]
     closed: Bool[Array, " C"]
+    gain: Float[Array, " C"]  # m/s, what the accelerations give contacts in a whole step, at most
     again: Bool[Array, ""]  # the step has been cut here: there is more of it
     contact: Bool[Array, ""]
     overflow: Int[Array, ""]
@@ -130,16 +133,16 @@ class _Stepping:
         forces = jnp.zeros((self.system.n_candidates, self.system.dim), now.x.dtype)
         none = jnp.zeros_like(now.acted)
         no = jnp.asarray(False)
-        start = _Segment(now.x, now.v, zero, forces, none, none, no, no, now.overflow, now.residual)
+        start = _Segment(now.x, now.v, zero, forces, none, none, forces[:, 0], no, no, now.overflow, now.residual)
 
         # Both ends are one program, run twice: most of it is the solver.
         def end_of(state: _Segment, first: Bool[Array, ""]):
             state, change = jax.lax.cond(
                 first,
-                lambda: self.touching(state, now.left, count),
+                lambda: self.touching(state, now.left),
                 lambda: (state, jnp.zeros_like(state.pressing)),
             )
-            state, held = self.act(state, change, first)
+            state, held = self.act(state, change, first, count)
             return jax.lax.cond(first, lambda: self.move(state, held, now, count), lambda: state), None
 
         end, _ = jax.lax.scan(end_of, start, jnp.array([True, False]))
@@ -154,9 +157,7 @@ class _Stepping:
             missed=now.missed | (end.again & (count == self.stepper.events)),
         )
 
-    def touching(
-        self, state: _Segment, left: Float[Array, ""], count: Int[Array, ""]
-    ) -> tuple[_Segment, Float[Array, "C d"]]:
+    def touching(self, state: _Segment, left: Float[Array, ""]) -> tuple[_Segment, Float[Array, "C d"]]:
         """Which contacts are closed and stay so, and how fast all contacts' velocities change without them (m/s^2)."""
         motion = self.rate((state.x, state.v))
 
@@ -167,15 +168,15 @@ class _Stepping:
         (velocity, candidates), (change, _) = jax.jvp(seen, (state.x, state.v), motion)
         # What the accelerations of the points can give a contact: no direction and no cancellation is in it.
         push = jnp.linalg.norm(motion[1], axis=-1)[candidates.stencil]
-        gain = left * jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * push, axis=1)
-        leaves = 1.0 if self.stepper.impact == "step" else jnp.minimum(_RETURNS * 2.0 ** (count / 2), 1.0)
-        normal = velocity[:, 0]
-        closed = candidates.gap <= _NEAR * left * gain
-        lasts = jax.lax.stop_gradient(closed & (normal >= -_CLOSING * gain) & (normal <= leaves * gain))
-        return state._replace(lasts=lasts, closed=lasts), change * left
+        gain = jax.lax.stop_gradient(
+            self.stepper.dt * jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * push, axis=1)
+        )
+        normal, gap = jax.lax.stop_gradient((velocity[:, 0], candidates.gap))
+        lasts = (gap <= _NEAR * left * gain) & (normal >= -_CLOSING * gain) & (normal <= _LEAVING * gain)
+        return state._replace(lasts=lasts, closed=lasts, gain=gain), change * left
 
     def act(
-        self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""]
+        self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""], count: Int[Array, ""]
     ) -> tuple[_Segment, Float[Array, "C d"]]:
         """Let contacts act at an end of a segment: those that last are held, the others hit.
 
@@ -196,6 +197,8 @@ class _Stepping:
             free = free.at[:, 0].add(jnp.where(held, room, 0))
         together = islands(contacts.delassus, d)
         reference = jnp.maximum(jnp.abs(free), jnp.abs(before))
+        slow = jnp.minimum(_REBOUNDS[stepper.impact] * jnp.asarray(2.0, before.dtype) ** (count / 2), 1.0)
+        slow = slow.astype(before.dtype) * state.gain[index]
 
         class Acting(NamedTuple):
             velocity: Float[Array, "K d"]  # of the contacts
@@ -204,7 +207,7 @@ class _Stepping:
         def part(acting: Acting, hits: Bool[Array, ""]):
             hit = active & ~held & (acting.velocity[:, 0] < 0) & ~first
             these = jnp.where(hits, active & jnp.any(together & hit, axis=1), held)
-            problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, hits)
+            problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, hits, slow)
             jump = dissipative(problem, system.contact_model(problem, smoothing=stepper.smoothing))
             impulse = _total(jump)
             impulse = impulse - jnp.where(hits, 0, past)
@@ -273,16 +276,17 @@ class _Stepping:
         )
 
 
-def _only(contacts: ContactState, these: Bool[Array, " K"], velocity, reference, rebounds) -> ContactState:
-    """The problem of `these` contacts alone, with their velocities."""
+def _only(contacts: ContactState, these: Bool[Array, " K"], velocity, reference, rebounds, slow) -> ContactState:
+    """The problem of `these` contacts alone, with their velocities; rebounds that would be `slow` (m/s) are none."""
     d = velocity.shape[1]
     rows = jnp.repeat(these, d)
+    fast = jax.lax.stop_gradient(-contacts.restitution * velocity[:, 0] > slow)
     return contacts._replace(
         active=contacts.active._replace(active=contacts.active.active & these),
         delassus=jnp.where(rows[:, None] & rows, contacts.delassus, 0),
         velocity=jnp.where(these[:, None], velocity, 0),
         target=jnp.zeros_like(velocity),
-        restitution=jnp.where(rebounds, contacts.restitution, 0),
+        restitution=jnp.where(jnp.asarray(rebounds) & fast, contacts.restitution, 0),
         reference=jnp.where(these[:, None], reference, 0),
         rebounds=rebounds,
     )
