@@ -157,6 +157,18 @@ def test_pose_files(tmp_path, tosses, suffix, ragged):
     assert np.array_equal(again.length, recording.length)
 
 
+@pytest.mark.parametrize("decimals", [3, 4, 6])
+def test_times_of_poses_may_be_rounded(tmp_path, tosses, decimals):
+    arrays = content(tosses)
+    times = np.round(1.7e9 + np.arange(61) / 120, decimals)
+    del arrays["dt"]
+    np.savez(tmp_path / "poses.npz", **arrays, time=times)
+    assert abs(load_poses(tmp_path / "poses.npz")[0].dt - 1 / 120) < 2 * 10.0**-decimals / 61
+    np.savez(tmp_path / "gap.npz", **arrays, time=times + (times > times[30]))
+    with refused("time must have equal steps; that after sample 30 was 1.008"):
+        load_poses(tmp_path / "gap.npz")
+
+
 BROKEN = {
     "no poses": ({"position": None}, "position or pos is missing"),
     "shape": ({"quaternion": np.zeros((8, 61, 3))}, "quaternion must have the shape"),

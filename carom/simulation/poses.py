@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from carom.checks import require
 from carom.errors import CaromError
 from carom.mechanics.bodies import embed_pose, embed_velocity, recover_pose
+from carom.simulation.clock import Irregular, clock_of, digit_of, rounding_of
 from carom.simulation.recording import Recording
 
 NAMES = {
@@ -42,6 +43,8 @@ NAMES = {
     "group": ("group",),
     "dup_of": ("dup_of",),
 }
+POSE_STEP_TOLERANCE = 1e-3
+"""Largest difference of two time steps that count as equal, relative to the step: the clocks of cameras jitter."""
 WINDOW = 3
 """Samples on each side that a velocity is estimated from, as far as no impact lies between."""
 
@@ -199,12 +202,18 @@ def _time_step(arrays: dict[str, np.ndarray]) -> float:
         return float(arrays.pop("dt"))
     require(time is not None and time.ndim == 1 and len(time) > 1, "dt (s) is missing, and there is no time (time,).")
     assert time is not None
-    steps = np.diff(time)
-    require(
-        bool(np.all(np.abs(steps - np.median(steps)) <= 1e-3 * np.median(steps))),
-        f"time must have equal steps; they were {steps.min():.4g} to {steps.max():.4g} s. Resample to one rate.",
-    )
-    return float(np.mean(steps))
+    rows = np.asarray(time, float)[None]
+    require(bool(np.isfinite(rows).all()), "time must be finite. Give dt in its place, or repair it.")
+    valid = np.ones(rows.shape, bool)
+    digit = np.full((1, 1), digit_of(time[None], valid))
+    rounding = 2 * rounding_of(time, float(np.abs(rows).max()))
+    found = clock_of(rows, valid, digit=digit, rounding=rounding, tolerance=POSE_STEP_TOLERANCE)
+    if isinstance(found, Irregular):
+        raise CaromError(
+            f"time must {'increase' if found.back else 'have equal steps'}; that after sample {found.sample} was "
+            f"{found.step:.6g} s, most were {found.typical:.6g} s. Resample to one rate."
+        )
+    return found.step
 
 
 def _padded(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
