@@ -23,7 +23,7 @@ from carom.cli.tosses import learn_and_measure
 from carom.contact.impulses import contact_model_of
 from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS, LearnConfig
-from carom.learning.dataset import Dataset
+from carom.learning.dataset import Dataset, in_pieces
 from carom.learning.devices import is_first, start_processes
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
@@ -89,7 +89,7 @@ class Learn:
         for k, word in enumerate(words):
             if word == "--from" or word.startswith("--from="):
                 folder = word.removeprefix("--from").removeprefix("=") or "".join(words[k + 1 : k + 2])
-                require(bool(folder), "from must be a run folder; nothing came after it.")
+                require(bool(folder), "--from must be a run folder; nothing came after it.")
                 return cls._of_run(RunFolder.open(folder))
         return None
 
@@ -134,18 +134,18 @@ class Learn:
         self.config.prepare(truth)
         require(
             self.data is not None or not chosen.own,
-            f"data is needed for {chosen.name}: a trajectory file to learn from.",
+            f"data is needed for {chosen.name}: give a trajectory file to learn from, --data FILE.",
         )
         contact_model_of(self.data_contact_model, argument="data_contact_model")
         require(
             0 <= self.data_noise < np.inf,
-            f"data_noise must be a finite number of at least 0; it was {self.data_noise}.",
+            f"--data-noise must be a finite number of at least 0; it was {self.data_noise}.",
         )
         require(
             self.data is None or not self.data_noise,
-            f"data_noise is for simulated data; it was {self.data_noise}, and data {str(self.data)!r}.",
+            f"--data-noise is for simulated data; it was {self.data_noise}, and --data {str(self.data)!r}.",
         )
-        require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
+        require(self.trajectories >= 8, f"--trajectories must be at least 8; it was {self.trajectories}.")
         if self.data is not None and can_learn_tosses(truth):
             self._run_tosses(console, chosen)
             return
@@ -181,12 +181,14 @@ class Learn:
     def _run_tosses(self, console: Console, chosen: Chosen) -> None:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
         self.tosses.check()
-        require(self.process_count == 1, f"process_count must be 1 for recorded tosses; it was {self.process_count}.")
+        require(self.process_count == 1, f"--process-count must be 1 for recorded tosses; it was {self.process_count}.")
         folder = RunFolder.choose(self.out, f"{self.task}-tosses", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
         data = load_recording(self.data or "", task=self.task)
         if self.val is None:
+            count = data.n_trajectories
+            require(count >= 2, f"--data must hold at least 2 tosses, or --val others; it held {count}.")
             parts = Dataset.split(data, seed=self.config.seed)
             data, val = parts.train, parts.val
         else:
@@ -234,7 +236,7 @@ class Learn:
         truth = chosen.system
         if self.data is None:
             for name in ("val", "test"):
-                require(getattr(self, name) is None, f"{name} needs --data: give the file to train on too.")
+                require(getattr(self, name) is None, f"--{name} needs --data: give the file to train on too.")
             console.print(f"Simulating {self.task} ...", highlight=False)
             held = max(self.trajectories // 8, 2)
             counts = (self.trajectories, held, held)
@@ -250,6 +252,10 @@ class Learn:
             return Dataset(train, val), test
         data = load_recording(self.data, task=chosen.task)
         test = load_recording(self.test, task=chosen.task) if self.test else None
+        least = 1 + (self.test is None) + (self.val is None)
+        data, word = in_pieces(data, least, self.config.states)
+        if word:
+            console.print(word, soft_wrap=True, highlight=False)
         if test is None:
             data, test = _hold_out(data, self.config.seed)
         if self.val is not None:

@@ -1,6 +1,7 @@
 """Training data: short chunks of recorded trajectories, about half of them with a contact."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +12,9 @@ from carom.checks import require
 from carom.simulation.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
+
+PIECES = 10
+"""Into how many pieces of equal length a single trajectory is cut."""
 
 
 class Chunks(eqx.Module):
@@ -86,7 +90,11 @@ class Dataset(eqx.Module):
         Where they are of several sessions (`group`), each session stays whole, and `val` is a share of the sessions.
         """
         n = recording.n_trajectories
-        require(n >= 2, f"a recording must have at least 2 trajectories to be split; it had {n}.")
+        require(
+            n >= 2,
+            f"a recording must have at least 2 trajectories to be split; it had {n}. Cut it into pieces first: "
+            f"recording.cut(samples), with up to {int(recording.length.max()) // 2} samples each.",
+        )
         require(0 < val < 1, f"val must be a share between 0 and 1; it was {val}.")
         each = np.arange(n) if recording.group is None else recording.group
         sessions = np.unique(each)
@@ -94,6 +102,31 @@ class Dataset(eqx.Module):
         order = np.random.default_rng(seed).permutation(sessions)
         held = np.isin(each, order[: min(max(1, round(val * len(sessions))), len(sessions) - 1)])
         return cls(recording.select(~held), recording.select(held))
+
+
+def in_pieces(recording: Recording, least: int, shortest: int) -> tuple[Recording, str]:
+    """A recording of at least `least` trajectories: as it is, or cut into pieces; and a word about that, or "".
+
+    **Arguments:** `shortest`, the least number of samples of a piece.
+
+    **Raises:** `CaromError` for a recording that is too short to cut.
+    """
+    n, longest = recording.n_trajectories, int(recording.length.max())
+    if n >= least:
+        return recording, ""
+    samples = max(int(recording.length.sum()) // PIECES, shortest)
+    found = int(np.sum(recording.length // samples))
+    require(
+        found >= least,
+        f"data must hold at least {least} trajectories to learn from and to be tested with; it held {n} of up to "
+        f"{longest} samples, which is too little to cut into pieces of {shortest}. Record more.",
+    )
+    # Pieces of one session must be divided here, for want of another.
+    pieces = replace(recording.cut(samples), group=None)
+    return pieces, (
+        f"The data have {n} {'trajectory' if n == 1 else 'trajectories'} of up to {longest} samples: cut into {found} "
+        f"pieces of {samples}. Several motions from different starts would tell more."
+    )
 
 
 def contact_flags(recording: Recording, system: System) -> Bool[np.ndarray, "N T"]:
@@ -133,10 +166,10 @@ def closing(recording: Recording, system: System) -> Int[np.ndarray, " P"]:
 
 
 def recording_of(trajectory: Trajectory, *, task: str = "", source: str = "") -> Recording:
-    """A batch of simulated trajectories as a recording, to learn from or to write to a file."""
-    return Recording.of(
-        trajectory.x, trajectory.v, time=trajectory.time, contact=trajectory.contact, task=task, source=source
-    )
+    """Simulated trajectories, or a single one, as a recording, to learn from or to write to a file."""
+    x, v = (part.reshape(-1, *part.shape[-3:]) for part in (trajectory.x, trajectory.v))
+    contact = trajectory.contact.reshape(-1, trajectory.contact.shape[-1])
+    return Recording.of(x, v, time=trajectory.time, contact=contact, task=task, source=source)
 
 
 def trajectory_of(recording: Recording, k: int) -> Trajectory:

@@ -101,6 +101,28 @@ class Recording(eqx.Module):
         contact, group = (None if part is None else part[rows] for part in (self.contact, self.group))
         return replace(self, x=self.x[rows], v=self.v[rows], contact=contact, length=self.length[rows], group=group)
 
+    def cut(self, samples: int) -> "Recording":
+        """The same motion in pieces of `samples` samples, each a trajectory; what is left over at ends is left out.
+
+        Raises:
+            CaromError: if no trajectory has so many samples.
+        """
+        longest = int(self.length.max())
+        require(2 <= samples <= longest, f"samples must be from 2 to {longest}, the longest; it was {samples}.")
+        rows, starts = np.array(
+            [(k, s) for k, count in enumerate(self.length) for s in range(0, int(count) - samples + 1, samples)]
+        ).T
+        at = rows[:, None], starts[:, None] + np.arange(samples)
+        return replace(
+            self,
+            x=self.x[at],
+            v=self.v[at],
+            contact=None if self.contact is None else self.contact[at],
+            time=self.dt * np.arange(samples),
+            length=np.full(len(rows), samples),
+            group=None if self.group is None else self.group[rows],
+        )
+
 
 def check_system(recording: Recording, system: System, what: str = "the recording") -> None:
     """Raise `CaromError` unless the recording, which the message calls `what`, has the points of the system."""
@@ -128,7 +150,9 @@ def _numbers(name: str, value: Any, axes: tuple[str, ...]) -> np.ndarray:
     wanted = "hold floating-point numbers or integers"
     require_part(array.dtype.kind in "fiu", name, wanted, array.dtype, "convert it to float64")
     wanted = f"have the axes ({', '.join(axes)})"
-    require_part(array.ndim == len(axes), name, wanted, f"of shape {array.shape}", "reshape it")
+    one = axes == STATE_AXES and array.ndim == len(axes) - 1
+    advice = f"for one trajectory give {name}[None]" if one else "reshape it"
+    require_part(array.ndim == len(axes), name, wanted, f"of shape {array.shape}", advice)
     return array
 
 

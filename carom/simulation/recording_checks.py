@@ -7,6 +7,9 @@ from jaxtyping import Bool, Float
 
 from carom.simulation.recording import Recording
 
+ENOUGH = 2
+"""Fewer trajectories are one recording alone."""
+
 
 class Finding(NamedTuple):
     """One check: what was found, and what to do about it ("" if nothing)."""
@@ -40,6 +43,10 @@ def check_recording(recording: Recording) -> list[Finding]:
         Finding("speed, median and largest", f"{np.median(speed):.3g}, {speed.max():.3g} m/s", ""),
         Finding("way of a step, typical", f"{motion:.2g} m", "" if motion > 0 else "nothing moves"),
     ]
+    if recording.n_trajectories < ENOUGH:
+        count = f"{recording.n_trajectories} of up to {int(recording.length.max())} samples"
+        advice = "several starts tell more; `carom learn` cuts these into pieces (in Python: recording.cut(samples))"
+        out.append(Finding("trajectories", count, advice))
     noise = position_noise(recording)
     if noise is not None and motion > 0:
         share = noise / motion
