@@ -54,7 +54,7 @@ class Evaluate:
         if config.get("tosses") is not None:
             self._evaluate_tosses(run, truth)
             return
-        require(self.against is None, "against compares runs that learned from recorded tosses; this one did not.")
+        require(self.against is None, "--against compares runs that learned from recorded tosses; this one did not.")
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, truth)
         test = load_recording(self.data or run.path / TEST_DATA, task=chosen.task)

@@ -66,12 +66,12 @@ class Simulate:
                 system.with_contact_model(self.contact_model),
                 f"{source}, contact model {self.contact_model}",
             )
-        require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
+        require(self.trajectories >= 1, f"--trajectories must be at least 1; it was {self.trajectories}.")
         out = Path(f"{chosen.stem}.h5") if self.out is None else self.out
         check_writable(out)
         require(
             self.initial is not None or not chosen.own,
-            f"initial is needed for {self.task}: a trajectory file, to start from its first states.",
+            f"initial is needed for {self.task}: give a file to start from its first states, --initial FILE.",
         )
         first = None if self.initial is None else load_recording(self.initial, task=chosen.task)
         if first is not None:

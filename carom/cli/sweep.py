@@ -82,7 +82,7 @@ class Sweep:
             raise CaromError("carom sweep needs optuna: pip install 'carom[sweep]'.") from error
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         for name in ("trials", "workers"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
+            require(getattr(self, name) >= 1, f"--{name} must be at least 1; it was {getattr(self, name)}.")
         space, chosen, console = parse_space(self.over), choose(self.task), Console()
         combinations = grid(space) if self.method == "grid" else []
         folder = Path("sweeps") / chosen.stem if self.out is None else self.out
