@@ -80,7 +80,8 @@ class Dataset(eqx.Module):
         )
         require(
             abs(self.train.dt - self.val.dt) <= 1e-6 * self.train.dt,
-            f"train and val must have one time step; they had {self.train.dt} s and {self.val.dt} s.",
+            f"train and val must have one time step; they had {self.train.dt} s and {self.val.dt} s. If that is the "
+            "rounding of their times, write more digits, or both into one file to be split.",
         )
 
     @classmethod
