@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import carom
+from carom.cli.outcome import most_eventful
 from carom.learning.evaluate import state_errors
 
 
@@ -48,6 +49,35 @@ def test_state_errors_have_the_closed_form():
     assert np.allclose(relative[0, :2], [0, 1 / 5])
     assert np.allclose(bounded[0, :2], [0, 1 / np.sqrt(25 + 32)])
     assert np.isnan(relative[0, 2])  # beyond the trajectory's end
+
+
+def test_what_comes_after_a_trajectory_has_ended_is_not_measured(elastic, monkeypatch):
+    system, data = elastic
+    length = np.array([5, 9, 20, 33, 40, 41])
+    ragged = carom.Recording.of(data.x, data.v, dt=data.dt, contact=data.contact, length=length)
+    after = ~ragged.valid
+    predicted = carom.Trajectory(
+        x=jnp.asarray(np.where(after[..., None, None], 2 * data.x, data.x)),
+        v=jnp.asarray(np.where(after[..., None, None], 3 * data.v, data.v)),
+        contact=jnp.asarray(data.contact),
+        time=jnp.asarray(data.time),
+        overflow=jnp.asarray(7 * after),
+        residual=jnp.zeros(after.shape),
+    )
+    monkeypatch.setattr("carom.learning.evaluate.predict", lambda *arguments, **options: predicted)
+    measures, _ = carom.evaluate(system, ragged, truth=system)
+    assert measures["constraint_error"] < 1e-12
+    assert measures["overflowed_contacts"] == 0
+    whole = np.asarray(system.energy(jnp.asarray(data.x), jnp.asarray(data.v)))
+    energy = [part[:n] for part, n in zip(whole, length, strict=True)]
+    drift = max(np.abs(part - part[0]).max() for part in energy) / max(np.abs(part).max() for part in energy)
+    assert measures["energy_drift"] == pytest.approx(drift, rel=1e-12)
+    assert measures["trajectory_error"] == 0
+    # The busiest trajectory is that with the most contact before its end.
+    flags = after.copy()
+    flags[5, 3] = True
+    busy = carom.Recording.of(data.x, data.v, dt=data.dt, contact=flags, length=length)
+    assert most_eventful(busy) == 5
 
 
 def test_a_prediction_that_is_lost_counts_as_lost(elastic):

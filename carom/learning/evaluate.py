@@ -113,7 +113,7 @@ def evaluate(
     relative, bounded = state_errors(recording, predicted)
     later, later_bounded = relative[:, 1:], bounded[:, 1:]
     per_trajectory = np.nanmean(later, axis=1)
-    count = len(per_trajectory)
+    count, valid = len(per_trajectory), recording.valid  # a prediction goes on where its trajectory has ended
     out: dict[str, Any] = {
         "trajectories": count,
         "steps": int(recording.length.max()) - 1,
@@ -122,8 +122,8 @@ def evaluate(
         "trajectory_error_median": float(np.median(per_trajectory)),
         "trajectory_error_geometric": float(np.mean(np.exp(np.nanmean(np.log(np.maximum(later, 1e-16)), axis=1)))),
         "bounded_error": float(np.mean(np.nanmean(later_bounded, axis=1))),
-        "constraint_error": float(np.max(np.abs(np.asarray(system.constraints(predicted.x))), initial=0.0)),
-        "overflowed_contacts": int(np.sum(predicted.overflow)),
+        "constraint_error": float(np.max(np.abs(np.asarray(system.constraints(predicted.x)))[valid], initial=0.0)),
+        "overflowed_contacts": int(np.sum(np.asarray(predicted.overflow)[valid])),
     }
     if truth is not None:
         known = physical_quantities(system)
@@ -134,5 +134,6 @@ def evaluate(
             out["mass_ratio_error"] = np.abs(mass_ratios(system) / mass_ratios(truth) - 1).tolist()
         if np.all(np.asarray(truth.restitution) == 1) and np.all(np.asarray(truth.friction) == 0):
             energy = np.asarray(truth.energy(predicted.x, predicted.v))
-            out["energy_drift"] = float(np.max(np.abs(energy - energy[:, :1])) / np.max(np.abs(energy)))
+            drift = np.abs(energy - energy[:, :1])[valid]
+            out["energy_drift"] = float(np.max(drift) / np.max(np.abs(energy[valid])))
     return out, predicted
