@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 
 from carom.cli.tables import property_names
+from carom.errors import CaromError
 from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import trajectory_of
@@ -27,7 +28,7 @@ def what_is_told(
 ) -> Identification | None:
     """What the recording tells of the properties of a system learned with `config`.
 
-    None for a baseline, which has no properties, and for a system that is too large.
+    None for a baseline, which has no properties, for a system that is too large, and where it cannot be found.
     """
     if config["model"] in BASELINES:
         return None
@@ -35,14 +36,18 @@ def what_is_told(
         console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
         return None
     console.print("Finding what the data can tell ...", highlight=False)
-    return identify(
-        system,
-        recording,
-        learned=config["learn"],
-        formulation=FORMULATIONS[config["model"]],
-        compensation_steps=config["compensation_steps"],
-        project=config["project"],
-    )
+    try:
+        return identify(
+            system,
+            recording,
+            learned=config["learn"],
+            formulation=FORMULATIONS[config["model"]],
+            compensation_steps=config["compensation_steps"],
+            project=config["project"],
+        )
+    except CaromError as error:  # what was learned is to be kept and measured all the same
+        console.print(f"It cannot be found: {error}", highlight=False)
+        return None
 
 
 def pictures(
@@ -75,4 +80,4 @@ def one_of(batch: Trajectory, k: int, length: int) -> Trajectory:
 
 def most_eventful(test: Recording) -> int:
     """The test trajectory with the most contact, the first of equals."""
-    return 0 if test.contact is None else int(np.argmax(test.contact.sum(axis=1)))
+    return 0 if test.contact is None else int(np.argmax((test.contact & test.valid).sum(axis=1)))
