@@ -16,7 +16,7 @@ import carom
 from carom.atomic import write_whole
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
-from carom.cli.outcome import TEST_DATA, pictures, what_is_told
+from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
 from carom.cli.systems import Chosen, choose, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import learn_and_measure
@@ -271,6 +271,7 @@ class Learn:
                 "identification": found and dataclasses.asdict(found),
             },
         )
+        warn_if_far_off(console, measures)
         console.print(property_table(system, chosen.system, chosen.name if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))

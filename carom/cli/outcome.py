@@ -11,7 +11,7 @@ from carom.errors import CaromError
 from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import trajectory_of
-from carom.learning.evaluate import state_errors
+from carom.learning.evaluate import far_off, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.run import TRUTH, RunFolder
 from carom.learning.train import quantities
@@ -48,6 +48,31 @@ def what_is_told(
     except CaromError as error:  # what was learned is to be kept and measured all the same
         console.print(f"It cannot be found: {error}", highlight=False)
         return None
+
+
+def warn_if_far_off(console: Console, measures: dict[str, Any]) -> None:
+    """Say before all else where predictions do not explain the data (`far_off`)."""
+    if far_off(measures):
+        say_unexplained(
+            console,
+            f"predictions are off by {percent(measures['trajectory_error_median'])} in the median and "
+            f"{percent(measures['trajectory_error'])} in the mean, above {percent(measures['error_allowed'])}",
+        )
+
+
+def percent(share: float) -> str:
+    """A share in words that stay short, whatever became of it."""
+    return "not a number" if np.isnan(share) else f"{share:.0%}" if share < 10 else "more than 1000%"
+
+
+def say_unexplained(console: Console, why: str) -> None:
+    """The warning, in its colour."""
+    console.print(
+        f"The learned system does not explain the data: {why} (docs/identifiability.md).",
+        style="bold yellow",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 def pictures(

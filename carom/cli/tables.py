@@ -75,9 +75,9 @@ def _told(estimate: Estimate) -> tuple[str, str, str]:
     """How many impacts tell of a quantity, its value with half of its 95 % interval, and the verdict."""
     impacts = "" if estimate.impacts is None else str(estimate.impacts)
     if estimate.verdict == "bounded below":
-        return impacts, "", f"at least {estimate.bound:.3f}"
+        return impacts, "", f">= {estimate.bound:.3f}"
     if estimate.verdict == "bounded above":
-        return impacts, "", f"at most {estimate.bound:.3f}"
+        return impacts, "", f"<= {estimate.bound:.3f}"
     interval = f"{max(estimate.value, 0.0):.4f} +- {1.96 * estimate.standard_error:.1g}"  # never -0.0000
     return impacts, interval, "yes" if estimate.verdict == "identified" else "no"
 

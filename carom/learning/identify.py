@@ -22,7 +22,7 @@ trade; its other layers are held. The values reported (`refined`) are this estim
 Friction is told by impacts that slide: a contact that sticks only says that its friction is at least the ratio of
 tangential to normal impulse that held it. Restitution is told by impacts whose rebound it decides: where the contact
 model's target velocity, which undoes the penetration, is the greater, it is only said to be at most the ratio of
-rebound to compression. However tight, that is a bound (e = 0 is said by "at most 0.02"), and never "identified".
+rebound to compression. However tight, that is a bound (e = 0 is said by "<= 0.02"), and never "identified".
 
 An impact counts where the data show it: a contact of the property overlaps at the recorded end of the step, not only at
 the predicted one. Recordings whose impacts happen between the samples are refused (`meetings.py`).
