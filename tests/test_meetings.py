@@ -46,6 +46,8 @@ def test_impacts_between_the_samples_are_found(noise):
     assert found.not_seen
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_impacts_at_the_samples_are_found():
     """carom's own motion through the same walls overlaps them, but for samples where noise hides it."""
     rng = np.random.default_rng(1)
