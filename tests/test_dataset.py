@@ -4,8 +4,12 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from rich.console import Console
+from systems import refused
 
 import carom
+from carom.cli.learn import Learn
+from carom.cli.systems import Chosen
 from carom.learning.dataset import Chunks, Dataset, closing, contact_flags, in_pieces, recording_of, trajectory_of
 
 
@@ -117,6 +121,25 @@ def test_one_recording_is_cut_into_pieces():
         carom.CaromError, match="it held 1 of up to 12 samples, which is too little to cut into pieces of 5"
     ):
         in_pieces(recording(n=1), 3, 5)
+
+
+def test_sessions_are_not_shared_by_training_validation_and_test(tmp_path):
+    """What `carom learn` holds out is whole sessions, so that no test trajectory is like one that was learned from."""
+    x = np.random.default_rng(0).normal(size=(24, 5, 1, 2))
+    x[:, :, 0, 0] += np.repeat(100.0 * np.arange(8), 3)[:, None]  # the session can be read from the positions
+    data = carom.Recording.of(x, np.zeros_like(x), dt=0.01, group=np.repeat(np.arange(8), 3))
+    carom.save_recording(tmp_path / "data.h5", data)
+    system = carom.System(bodies=[carom.PointMass(1.0, 0.1)], dim=2)
+    chosen = Chosen("mine.py", system, b"")
+    parts, test = Learn("mine.py", data=tmp_path / "data.h5").data_sets(chosen, Console())
+    sessions = [set(np.round(part.x[:, 0, 0, 0] / 100).astype(int)) for part in (parts.train, parts.val, test)]
+    assert sorted(session for part in sessions for session in part) == list(range(8))
+    counts = [part.n_trajectories for part in (parts.train, parts.val, test)]
+    assert counts == [18, 3, 3]
+    two = carom.Recording.of(x, np.zeros_like(x), dt=0.01, group=np.repeat([4, 9], 12))
+    carom.save_recording(tmp_path / "two.h5", two)
+    with refused("data must hold at least 3 sessions (group), to train, validate and test; it held 2."):
+        Learn("mine.py", data=tmp_path / "two.h5").data_sets(chosen, Console())
 
 
 @pytest.mark.parametrize(

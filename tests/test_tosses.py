@@ -2,17 +2,20 @@
 
 import csv
 import dataclasses
+import io
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 from systems import ball_on_floor, refused
 
 import carom
 from carom.cli.main import main
+from carom.cli.tosses import _warn_if_far_off
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
 from carom.learning.toss_parameters import CENTER, read_values, with_values
@@ -166,6 +169,15 @@ def test_recordings_are_of_the_centre_of_the_box(cube):
     assert np.allclose(recorded[1:] - recorded[:1], x[1:] - x[:1])
     assert np.allclose(body_points(system, recorded), x)
     assert np.allclose(body_points(system, moving), v)
+
+
+def test_predictions_of_tosses_that_are_far_off_are_called_so(tosses):
+    """Off by less or more than a tenth of the mean distance from the start."""
+    way = np.linalg.norm(tosses.x[:, :, 0] - tosses.x[:, :1, 0], axis=-1).mean(axis=1)
+    for share, expected in ((0.09, False), (0.11, True)):
+        text = io.StringIO()
+        _warn_if_far_off(Console(file=text), tosses, share * way)
+        assert ("does not explain the data" in text.getvalue()) == expected
 
 
 def test_a_toss_counts_to_its_own_end(cube, tosses):

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from carom.checks import require
 from carom.cli.arguments import FilePath, FolderPath, RunPath
-from carom.cli.outcome import TEST_DATA, pictures, what_is_told
+from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
 from carom.cli.systems import chosen_by
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import measure, nominal_width, other_run
@@ -71,6 +71,7 @@ class Evaluate:
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         with theme("dark" if self.dark else "light"):
             pictures(run, system, test, predicted, found)
+        warn_if_far_off(console, measures)
         console.print(property_table(system, truth, config["task"] if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))

@@ -16,14 +16,14 @@ import carom
 from carom.atomic import write_whole
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
-from carom.cli.outcome import TEST_DATA, pictures, what_is_told
+from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
 from carom.cli.systems import Chosen, choose, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import learn_and_measure
 from carom.contact.impulses import contact_model_of
 from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS, LearnConfig
-from carom.learning.dataset import Dataset, in_pieces
+from carom.learning.dataset import Dataset, hold_out, in_pieces, sessions_of
 from carom.learning.devices import is_first, start_processes
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
@@ -56,9 +56,9 @@ class Learn:
     data: FilePath = None
     """Trajectory file (.h5, .hdf5, .npz or .csv) to learn from; without it, data are simulated."""
     val: FilePath = None
-    """Trajectory file to validate on; without it, a tenth of the data."""
+    """Trajectory file to validate on; without it, a tenth of the data (of its sessions, if it has `group`)."""
     test: FilePath = None
-    """Trajectory file to test on; without it, a tenth of the data."""
+    """Trajectory file to test on; without it, a tenth of the data (of its sessions, if it has `group`)."""
     out: FolderPath = None
     """Run folder; by default runs/TASK-MODEL, with a number if that is taken."""
     resume: bool = False
@@ -277,6 +277,7 @@ class Learn:
                 "identification": found and dataclasses.asdict(found),
             },
         )
+        warn_if_far_off(console, measures)
         console.print(property_table(system, chosen.system, chosen.name if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))
@@ -315,12 +316,12 @@ def _tuples(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
-    """Keep a tenth of the trajectories for the test."""
-    n = data.n_trajectories
-    require(n >= 3, f"data must hold at least 3 trajectories, to train, validate and test; it held {n}.")
-    order = np.random.default_rng((seed, 2)).permutation(n)
-    count = max(1, round(n / 10))
-    return data.select(np.sort(order[count:])), data.select(np.sort(order[:count]))
+    """Keep a tenth of the trajectories for the test, or of the sessions where there are some."""
+    n = len(np.unique(sessions_of(data)))
+    what, more = ("trajectories", "") if data.group is None else ("sessions (group)", " Or give --val and --test.")
+    require(n >= 3, f"data must hold at least 3 {what}, to train, validate and test; it held {n}.{more}")
+    held = hold_out(data, 0.1, np.random.default_rng((seed, 2)))
+    return data.select(~held), data.select(held)
 
 
 def _digest(path: Path) -> str | None:

@@ -8,11 +8,14 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
 from carom.atomic import write_whole
+from carom.cli.outcome import percent, say_unexplained
 from carom.learning.dataset import trajectory_of
+from carom.learning.evaluate import FAR_OFF
 from carom.learning.model_file import load_model_into, save_model
 from carom.learning.protocols import (
     Protocol,
@@ -20,6 +23,7 @@ from carom.learning.protocols import (
     body_points,
     box_of,
     paired_difference,
+    pose_errors,
     protocol_starts,
     toss_errors,
 )
@@ -80,6 +84,7 @@ def measure(
     data = protocol_starts(recording, protocol, width)
     predicted = predict_tosses(system, data)
     errors = toss_errors(system, data, predicted, width)
+    _warn_if_far_off(console, data, errors.position * width / 100)
     out: dict[str, Any] = {"protocol": protocol, "tosses": len(errors.position), **errors.summary()}
     shown = {"learned": errors}
     table = Table(title=f"Protocol {protocol}: {len(errors.position)} tosses")
@@ -106,6 +111,15 @@ def measure(
     write_errors(run.path / f"toss_errors_{protocol}.csv", data, errors)
     _pictures(run, system, data, predicted, errors, shown)
     return out
+
+
+def _warn_if_far_off(console: Console, data: Recording, distance: Float[np.ndarray, " N"]) -> None:
+    """Say where predictions whose centres are off by `distance` (m) do not explain the tosses."""
+    way, _ = pose_errors(np.broadcast_to(data.x[:, :1], data.x.shape), data.x, data.length)
+    share = float(np.median(distance / np.maximum(way, 1e-300)))
+    if not share <= FAR_OFF:
+        why = f"predictions are off by {percent(share)} of the way from the start in the median, above {FAR_OFF:.0%}"
+        say_unexplained(console, why)
 
 
 def write_errors(path: Path, recording: Recording, errors: TossErrors) -> None:

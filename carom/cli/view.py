@@ -118,7 +118,7 @@ class View:
         """The trajectories to show, those with the most contact first."""
         if recording.contact is None:
             return recording.select(slice(self.trajectories))
-        order = np.argsort(-recording.contact.sum(axis=1), kind="stable")
+        order = np.argsort(-(recording.contact & recording.valid).sum(axis=1), kind="stable")
         return recording.select(order[: self.trajectories])
 
     def _serve(self, page: bytes, console: Console) -> None:

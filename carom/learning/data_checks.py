@@ -6,6 +6,7 @@ import numpy as np
 from carom.checks import require
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset, closed_contacts
+from carom.learning.meetings import check_meetings
 from carom.simulation.recording import Recording, check_system
 from carom.system import System
 
@@ -32,6 +33,8 @@ def check_dataset(skeleton: System, dataset: Dataset, config: LearnConfig) -> in
         )
         most = max(most, int(np.where(valid, closed_contacts(part.x, skeleton), 0).max()))
         check_not_inside(name, part, skeleton, valid)
+    if config.learns_contact:
+        check_meetings(dataset.train, skeleton, "the training data")
     return most
 
 

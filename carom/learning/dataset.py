@@ -97,11 +97,9 @@ class Dataset(eqx.Module):
             f"recording.cut(samples), with up to {int(recording.length.max()) // 2} samples each.",
         )
         require(0 < val < 1, f"val must be a share between 0 and 1; it was {val}.")
-        each = np.arange(n) if recording.group is None else recording.group
-        sessions = np.unique(each)
-        require(len(sessions) >= 2, "a recording of one session cannot be split: give a file to validate on.")
-        order = np.random.default_rng(seed).permutation(sessions)
-        held = np.isin(each, order[: min(max(1, round(val * len(sessions))), len(sessions) - 1)])
+        sessions = len(np.unique(sessions_of(recording)))
+        require(sessions >= 2, "a recording of one session cannot be split: give a file to validate on.")
+        held = hold_out(recording, val, np.random.default_rng(seed))
         return cls(recording.select(~held), recording.select(held))
 
 
@@ -128,6 +126,21 @@ def in_pieces(recording: Recording, least: int, shortest: int) -> tuple[Recordin
         f"The data have {n} {'trajectory' if n == 1 else 'trajectories'} of up to {longest} samples: cut into {found} "
         f"pieces of {samples}. Several motions from different starts would tell more."
     )
+
+
+def sessions_of(recording: Recording) -> Int[np.ndarray, " N"]:
+    """Each trajectory's session (`group`); each is one of its own where that was not recorded."""
+    return np.arange(recording.n_trajectories) if recording.group is None else recording.group
+
+
+def hold_out(recording: Recording, share: float, rng: np.random.Generator) -> Bool[np.ndarray, " N"]:
+    """Which trajectories to hold out: all of a `share` of the sessions, of at least one and never of all.
+
+    Trajectories of one session are alike, so that none may be learned from where another is held out.
+    """
+    each = sessions_of(recording)
+    order = rng.permutation(np.unique(each))
+    return np.isin(each, order[: min(max(1, round(share * len(order))), len(order) - 1)])
 
 
 def contact_flags(recording: Recording, system: System) -> Bool[np.ndarray, "N T"]:
@@ -163,6 +176,16 @@ def closing(recording: Recording, system: System) -> Int[np.ndarray, " P"]:
     for gaps, length in zip(all_gaps(recording.x, system), recording.length, strict=True):
         closed = gaps[:length] < 0
         np.add.at(out, index, (closed[1:] & ~closed[:-1]).sum(axis=0))
+    return out
+
+
+def properties_closed(x: Float[np.ndarray, "S n d"], system: System) -> Bool[np.ndarray, "S P"]:
+    """Of which contact properties a contact is closed, by state."""
+    out = np.zeros((len(x), system.n_properties), bool)
+    if system.contacts and len(x):
+        index = np.array([p for contact in system.contacts for p in contact.property_index])
+        states, contacts = np.nonzero(np.asarray(_gaps(system, jnp.asarray(x))) < 0)
+        out[states, index[contacts]] = True
     return out
 
 

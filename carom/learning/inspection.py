@@ -10,7 +10,9 @@ from carom.contact.limits import BendLimit, StretchLimit
 from carom.learning.config import LearnConfig
 from carom.learning.data_checks import LARGEST_DRIFT
 from carom.learning.dataset import Chunks, all_gaps, closing, contact_flags
+from carom.learning.meetings import meetings
 from carom.learning.refine import IdentifyConfig
+from carom.learning.tosses import can_learn_tosses
 from carom.mechanics.constraints import Rigid
 from carom.mechanics.potentials import Gravity
 from carom.simulation.recording import Recording, check_system
@@ -44,6 +46,7 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
     closings = closing(recording, system)
     if system.contacts:
         out.append(_depth(recording, system))
+        out += _meetings(recording, system)
     closed = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
     more = (_step_length(recording, system), _free_fall(recording, system, closed))
     out += [finding for finding in more if finding is not None]
@@ -75,6 +78,16 @@ def _depth(recording: Recording, system: System) -> Finding:
             place = f" (trajectory {k}, sample {int(share.max(axis=1).argmax())})"
     advice = f"bodies are through walls or each other{place}: check radii, walls and units" if deepest > 1 else ""
     return Finding("states in contact", f"{states / count:.0%}, the deepest {deepest:.0%} of what can be", advice)
+
+
+def _meetings(recording: Recording, system: System) -> list[Finding]:
+    """Whether impacts are at the samples; nothing of bodies that never meet. Tosses are learned in either case."""
+    found = meetings(recording, system)
+    if not sum(found):
+        return []
+    steps = found.not_seen and not can_learn_tosses(system)
+    advice = "impacts happen between the samples: friction and restitution cannot be learned" if steps else ""
+    return [Finding("where bodies meet", str(found), advice)]
 
 
 def _step_length(recording: Recording, system: System) -> Finding | None:
