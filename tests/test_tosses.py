@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from systems import ball_on_floor, refused
 
@@ -17,7 +18,7 @@ from carom.learning.protocols import body_points, box_points, paired_difference,
 from carom.learning.run import RunFolder
 from carom.learning.toss_parameters import CENTER, read_values, with_values
 from carom.learning.tosses import TossConfig, choose_segments, learn_tosses, predict_tosses, prepared
-from carom.mechanics.bodies import embed_pose, embed_velocity
+from carom.mechanics.bodies import embed_pose, embed_velocity, recover_velocity
 from carom.simulation.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
@@ -190,6 +191,53 @@ def test_protocol_b_starts_where_a_corner_can_touch(tosses):
     fallen = tosses.v[k, 0, 0] - np.array([0, 0, 9.61 * DT * started[k]])
     assert np.abs(data.v[k, 0, 0] - fallen).max() < 0.02
     assert np.array_equal(data.group, tosses.group)
+
+
+def flight(turns, velocity) -> carom.Recording:
+    """A body that falls past the height of protocol B while it turns (rotations (T, 3, 3)); no recorded velocity."""
+    time = DT * np.arange(len(turns))
+    center = np.array([0.0, 0.0, 0.4]) + velocity * time[:, None] - [0, 0, 4.905] * time[:, None] ** 2
+    x = np.asarray(embed_pose(jnp.asarray(center), jnp.asarray(turns)))[None]
+    return carom.Recording.of(x, np.zeros_like(x), dt=DT)
+
+
+@pytest.mark.parametrize("rate", [3.0, 60.0])
+def test_velocities_of_a_flight_with_many_turns(rate):
+    """At one rate, in closed form: 60 rad/s are .4 rad from sample to sample, and three turns before the start."""
+    axis, velocity = np.array([2.0, -1.0, 2.0]) / 3, np.array([0.3, -0.2, 1.0])
+    angles = rate * DT * np.arange(80)
+    turns = Rotation.from_rotvec(angles[:, None] * axis) * Rotation.from_euler("xyz", [0.3, -0.5, 1.0])
+    recording = flight(turns.as_matrix(), velocity)
+    data = protocol_starts(recording, "B", WIDTH)
+    start = int(recording.length[0] - data.length[0])
+    assert start > 40
+    found = [np.asarray(part[0]) for part in recover_velocity(jnp.asarray(data.x[:, 0]), jnp.asarray(data.v[:, 0]))]
+    assert np.allclose(found[0], velocity - [0, 0, 9.81 * DT * start], atol=1e-9)
+    assert np.allclose(found[1], rate * axis, atol=1e-9)
+
+
+def test_velocities_of_a_flight_that_wobbles():
+    """Euler's equations of a body with unequal moments, integrated by scipy to 1e-10: it turns at no one rate."""
+    moments, start_rate = np.array([1.0, 2.0, 4.0]), np.array([20.0, 3.0, -4.0])
+    inertia = moments.sum() - moments
+
+    def change(_, state):
+        turn, rate = state[:9].reshape(3, 3), state[9:]
+        spin = np.cross(np.broadcast_to(rate, (3, 3)), np.eye(3)).T
+        return np.concatenate([(turn @ spin).ravel(), -np.cross(rate, inertia * rate) / inertia])
+
+    time = DT * np.arange(80)
+    first = np.concatenate([np.eye(3).ravel(), start_rate])
+    motion = solve_ivp(change, (0, time[-1]), first, t_eval=time, rtol=1e-10, atol=1e-10).y.T
+    turns, rates = motion[:, :9].reshape(-1, 3, 3), motion[:, 9:]
+    recording = flight(turns, np.array([0.0, 0.0, 1.0]))
+    data = protocol_starts(recording, "B", WIDTH, moments)
+    start = int(recording.length[0] - data.length[0])
+    found = np.asarray(recover_velocity(jnp.asarray(data.x[:, 0]), jnp.asarray(data.v[:, 0]))[1][0])
+    true = turns[start] @ rates[start]
+    assert np.linalg.norm(true - turns[0] @ rates[0]) > 3
+    # Half steps are of second order: a share of (|omega| dt)^2 / 24, with |omega| dt = 0.14.
+    assert np.linalg.norm(found - true) < 1e-3 * np.linalg.norm(true)
 
 
 def test_paired_differences_know_sessions():

@@ -19,6 +19,7 @@ from carom.learning.protocols import (
     TossErrors,
     body_points,
     box_of,
+    moments_of,
     paired_difference,
     protocol_starts,
     toss_errors,
@@ -77,7 +78,7 @@ def measure(
     baseline: tuple[str, System] | None = None,
 ) -> dict[str, Any]:
     """Predict every toss and print, write and draw how far off that is; against a `baseline` too, toss by toss."""
-    data = protocol_starts(recording, protocol, width)
+    data = protocol_starts(recording, protocol, width, moments_of(system))
     predicted = predict_tosses(system, data)
     errors = toss_errors(system, data, predicted, width)
     out: dict[str, Any] = {"protocol": protocol, "tosses": len(errors.position), **errors.summary()}
