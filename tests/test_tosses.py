@@ -14,6 +14,8 @@ from systems import ball_on_floor, refused
 
 import carom
 from carom.cli.main import main
+from carom.cli.view import View
+from carom.learning.model_file import read_model_header
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
 from carom.learning.toss_parameters import CENTER, read_values, with_values
@@ -123,6 +125,34 @@ def test_values_are_read_as_they_were_written(cube):
     assert np.allclose(read_values(changed, names), values, rtol=1e-12)
     assert np.isclose(jnp.linalg.norm(changed.contacts[0].normal), 1)
     assert np.allclose(read_values(changed, ("half_width", "inertia")), read_values(cube, ("half_width", "inertia")))
+
+
+def box_on_two_planes() -> carom.System:
+    """A box of unequal edges above a table and a wall, which have properties of their own."""
+    return carom.System(
+        bodies=[carom.RigidBody(0.4, (1e-4, 2e-4, 3e-4))],
+        contacts=[
+            carom.CornerPlane([0], (0.06, 0.03, 0.015), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), property=1),
+            carom.CornerPlane([0], (0.06, 0.03, 0.015), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), property=0),
+        ],
+        potential=carom.Gravity((0.0, 0.0, -9.81)),
+        friction=(0.5, 0.2),
+        restitution=(0.9, 0.1),
+    )
+
+
+def test_a_box_keeps_its_proportions_and_a_wall_its_properties():
+    box, names = box_on_two_planes(), ("half_width", "inertia", "friction", "restitution")
+    values = read_values(box, names)
+    assert np.allclose(values, [0.035, 4e-4, 0.2, 0.1])  # mean half width, mean moment of inertia, those of the table
+    same = with_values(box, names, jnp.asarray(values))
+    assert np.allclose(same.contacts[0].half_widths, (0.06, 0.03, 0.015), rtol=1e-12)
+    changed = with_values(box, names, jnp.asarray([0.07, 8e-4, 0.3, 0.4]))
+    assert np.allclose(changed.contacts[0].half_widths, (0.12, 0.06, 0.03))
+    assert np.allclose(changed.bodies[0].moments, (2e-4, 4e-4, 6e-4))
+    assert np.allclose(changed.friction, (0.5, 0.3))
+    assert np.allclose(changed.restitution, (0.9, 0.4))
+    assert np.allclose(read_values(changed, names), [0.07, 8e-4, 0.3, 0.4])
 
 
 def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
@@ -289,3 +319,54 @@ def test_from_a_pose_file_to_a_table(tosses, tmp_path, monkeypatch, capsys):
     assert {row["session"] for row in rows} == {"0", "1"}
     for name in ("tosses.png", "toss_errors.png", "prediction.gif", "model.carom", "toss_errors_A.csv"):
         assert (tmp_path / "run" / name).stat().st_size > 100
+
+
+OWN = """
+import carom
+
+system = carom.System(
+    bodies=[carom.RigidBody(0.37, (3.9e-4, 3.9e-4, 3.9e-4))],
+    contacts=[carom.CornerPlane([0], 0.05, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), center=(1e-3, 0.0, 2e-3))],
+    potential=carom.Gravity((0.0, 0.0, -9.61)),
+    friction=0.2,
+    restitution=0.2,
+)
+"""
+
+
+@pytest.mark.slow
+def test_tosses_of_an_own_system_are_learned_measured_and_seen_by_one_rule(tosses, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAROM_CACHE", "")
+    monkeypatch.setattr("carom.cli.tosses._pictures", lambda *_: None)  # most of the time, three times
+    (tmp_path / "mine.py").write_text(OWN)
+    for name, part in (("train", tosses.select(slice(8))), ("test", tosses.select(slice(8, 13)))):
+        carom.save_recording(f"{name}.h5", dataclasses.replace(part, task=""))
+    words = ["learn", "mine.py", "--data", "train.h5", "--test", "test.h5", "--learn-of-toss", "friction"]
+    words += ["--horizons", "--evaluations", "1", "--toss-samples", "40", "--substeps", "2"]
+    main(words)
+    assert "Learning mine.py from 8 recorded tosses into runs/mine-tosses" in capsys.readouterr().out
+    run = tmp_path / "runs" / "mine-tosses"
+    assert (run / "system.py").read_text() == OWN
+    measured = json.loads((run / "report.json").read_text())["evaluation"]
+    assert measured["tosses"] == 5
+    main([*words, "--out", str(run), "--resume"])
+    assert json.loads((run / "report.json").read_text())["evaluation"] == measured
+    (tmp_path / "mine.py").unlink()  # the run has its own
+    main(["evaluate", str(run)])
+    again = json.loads((run / "evaluation.json").read_text())
+    assert {name: again[name] for name in measured} == measured
+    # What is shown is what was measured: errors of the shown poses, by the definitions, are those of the table.
+    shown = View(run, trajectories=5)._run_folder()
+    rows = list(csv.DictReader((run / "toss_errors_A.csv").read_text().splitlines()))
+    for k, (true, predicted) in enumerate(shown.pairs):
+        assert true is not None
+        np.testing.assert_allclose(true.x[0], predicted.x[0], atol=1e-12)
+        np.testing.assert_allclose(true.v[0], predicted.v[0], atol=1e-12)
+        middles = [np.asarray(box_points(shown.system, part.x))[:, 0] for part in (true, predicted)]
+        np.testing.assert_allclose(middles[0], tosses.x[8 + k, :, 0], atol=1e-12)
+        error = 100 * np.linalg.norm(middles[0] - middles[1], axis=1).mean() / 0.1
+        assert error == pytest.approx(float(rows[k]["position_percent"]), abs=1e-4)
+        assert predicted.contact.any()
+    header = read_model_header(run / "model.carom")
+    assert (header["impact"], header["compensation_steps"]) == ("event", 2.0)
