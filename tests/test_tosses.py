@@ -15,7 +15,6 @@ from systems import ball_on_floor, refused
 import carom
 from carom.cli.main import main
 from carom.cli.view import View
-from carom.learning.model_file import read_model_header
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
 from carom.learning.toss_parameters import CENTER, read_values, with_values
@@ -352,6 +351,16 @@ def test_tosses_of_an_own_system_are_learned_measured_and_seen_by_one_rule(tosse
     assert measured["tosses"] == 5
     main([*words, "--out", str(run), "--resume"])
     assert json.loads((run / "report.json").read_text())["evaluation"] == measured
+    kept = {}
+
+    def keep(*_, **options):
+        kept.update(options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("carom.cli.simulate.simulate", keep)
+    with pytest.raises(SystemExit):
+        main(["simulate", "mine.py", "--run-folder", str(run), "--initial", "test.h5"])
+    assert (kept["impact"], kept["compensation_steps"], kept["dt"]) == ("event", 2.0, pytest.approx(DT))
     (tmp_path / "mine.py").unlink()  # the run has its own
     main(["evaluate", str(run)])
     again = json.loads((run / "evaluation.json").read_text())
@@ -368,5 +377,3 @@ def test_tosses_of_an_own_system_are_learned_measured_and_seen_by_one_rule(tosse
         error = 100 * np.linalg.norm(middles[0] - middles[1], axis=1).mean() / 0.1
         assert error == pytest.approx(float(rows[k]["position_percent"]), abs=1e-4)
         assert predicted.contact.any()
-    header = read_model_header(run / "model.carom")
-    assert (header["impact"], header["compensation_steps"]) == ("event", 2.0)

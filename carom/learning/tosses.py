@@ -214,10 +214,11 @@ def toss_motions(system: System, recording: Recording, *, samples: int | None = 
 
     Its points are the body's own, from the centre of mass on; those of recordings are from the middle of its box.
     """
-    samples = recording.x.shape[1] - 1 if samples is None else min(samples, recording.x.shape[1] - 1)
+    most = recording.x.shape[1] - 1
+    count = most if samples is None else min(samples, most)
     stepper = toss_stepper(recording.dt, substeps)
     x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
-    return _motions(system.with_max_active(4), x0, v0, stepper, samples, substeps)
+    return _motions(system.with_max_active(4), x0, v0, stepper, count, substeps)
 
 
 def predict_tosses(system: System, recording: Recording, *, samples: int | None = None, substeps: int = 1):
