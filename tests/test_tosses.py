@@ -14,6 +14,8 @@ from systems import ball_on_floor, refused
 
 import carom
 from carom.cli.main import main
+from carom.cli.systems import Chosen
+from carom.cli.tosses import nominal_width, touching_height
 from carom.cli.view import View
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
@@ -23,6 +25,8 @@ from carom.mechanics.bodies import embed_pose, embed_velocity, recover_velocity
 from carom.simulation.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
+HEIGHT = np.sqrt(3) / 2 * WIDTH
+"""Half of the diagonal."""
 NAMES = ("inertia", "friction", "restitution")
 CONFIG = TossConfig(
     learn_of_toss=NAMES,
@@ -154,6 +158,16 @@ def test_a_box_keeps_its_proportions_and_a_wall_its_properties():
     assert np.allclose(read_values(changed, names), [0.07, 8e-4, 0.3, 0.4])
 
 
+def test_a_box_is_measured_from_where_its_corners_can_touch():
+    """sqrt(6^2 + 3^2 + 1.5^2) cm; errors are in % of its least width."""
+    chosen = Chosen("box.py", box_on_two_planes(), b"")
+    assert touching_height(chosen) == pytest.approx(0.01 * np.sqrt(36 + 9 + 2.25))
+    assert nominal_width(chosen) == pytest.approx(0.03)
+    cube = Chosen("cube", carom.task("cube"))
+    assert touching_height(cube) == pytest.approx(np.sqrt(3) / 2 * 0.1048)
+    assert nominal_width(cube) == 0.1048
+
+
 def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
     with refused("one rigid body with a CornerPlane"):
         learn_tosses(ball_on_floor(), tosses, CONFIG, progress=False)
@@ -206,14 +220,13 @@ def test_a_toss_counts_to_its_own_end(cube, tosses):
 
 
 def test_protocol_b_starts_where_a_corner_can_touch(tosses):
-    assert protocol_starts(tosses, "A", WIDTH) is tosses
-    data = protocol_starts(tosses, "B", WIDTH)
-    height = np.sqrt(3) / 2 * WIDTH
+    assert protocol_starts(tosses, "A", HEIGHT) is tosses
+    data = protocol_starts(tosses, "B", HEIGHT)
     started = tosses.length - data.length
     late = started > 0  # the others begin so low
     assert late.sum() > 50
-    assert np.all(data.x[late, 1, 0, 2] < height)
-    assert np.all(data.x[late, 0, 0, 2] >= height)
+    assert np.all(data.x[late, 1, 0, 2] < HEIGHT)
+    assert np.all(data.x[late, 0, 0, 2] >= HEIGHT)
     assert np.array_equal(data.x[0, 0], tosses.x[0, started[0]])
     # A long flight gives better velocities than one recorded sample.
     k = int(np.argmax(started))
@@ -237,7 +250,7 @@ def test_velocities_of_a_flight_with_many_turns(rate):
     angles = rate * DT * np.arange(80)
     turns = Rotation.from_rotvec(angles[:, None] * axis) * Rotation.from_euler("xyz", [0.3, -0.5, 1.0])
     recording = flight(turns.as_matrix(), velocity)
-    data = protocol_starts(recording, "B", WIDTH)
+    data = protocol_starts(recording, "B", HEIGHT)
     start = int(recording.length[0] - data.length[0])
     assert start > 40
     found = [np.asarray(part[0]) for part in recover_velocity(jnp.asarray(data.x[:, 0]), jnp.asarray(data.v[:, 0]))]
@@ -260,7 +273,7 @@ def test_velocities_of_a_flight_that_wobbles():
     motion = solve_ivp(change, (0, time[-1]), first, t_eval=time, rtol=1e-10, atol=1e-10).y.T
     turns, rates = motion[:, :9].reshape(-1, 3, 3), motion[:, 9:]
     recording = flight(turns, np.array([0.0, 0.0, 1.0]))
-    data = protocol_starts(recording, "B", WIDTH, moments)
+    data = protocol_starts(recording, "B", HEIGHT, moments)
     start = int(recording.length[0] - data.length[0])
     found = np.asarray(recover_velocity(jnp.asarray(data.x[:, 0]), jnp.asarray(data.v[:, 0]))[1][0])
     true = turns[start] @ rates[start]

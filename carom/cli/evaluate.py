@@ -10,7 +10,7 @@ from carom.cli.arguments import FilePath, FolderPath, RunPath
 from carom.cli.outcome import TEST_DATA, pictures, what_is_told
 from carom.cli.systems import Chosen, chosen_by
 from carom.cli.tables import evaluation_table, property_table, told_table
-from carom.cli.tosses import LearnedToss, measure, nominal_width
+from carom.cli.tosses import LearnedToss, measure
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
@@ -82,6 +82,6 @@ class Evaluate:
         other = None if self.against is None else LearnedToss.of_run(self.against)
         test = load_recording(self.data or run.path / TEST_DATA, task=chosen.task)
         check_system(test, chosen.system, str(self.data or TEST_DATA))
-        measures = measure(console, run, learned, test, self.protocol, nominal_width(chosen), other)
+        measures = measure(console, run, learned, test, self.protocol, chosen, other)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

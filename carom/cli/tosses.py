@@ -35,6 +35,9 @@ from carom.system import System
 PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": 8.1e-4, **dict.fromkeys(CENTER, 0.0)}
 """Of the acrylic cube (Pfrommer, Halm, Posa, CoRL 2020), with its mass in the middle."""
 
+NOMINAL = 0.1048
+"""Width of that cube (m)."""
+
 
 @dataclasses.dataclass(frozen=True)
 class LearnedToss:
@@ -69,14 +72,20 @@ def learn_and_measure(
     console.print(estimate_table(report, chosen.name))
     console.print("Mass is not learned: forces are in proportion to it, so that it drops out of the motion.")
     learned = LearnedToss(run.path.name, system, config.substeps)
-    measures = measure(console, run, learned, test, "A", nominal_width(chosen))
+    measures = measure(console, run, learned, test, "A", chosen)
     run.write_json(REPORT, {"learned": dataclasses.asdict(report), "evaluation": measures})
     console.print(f"Done ({report.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
 
 
 def nominal_width(chosen: Chosen) -> float:
     """The width that errors are given in: the cube's nominal one, whatever its recordings say."""
-    return 0.1048 if chosen.name == "cube" else 2 * float(np.min(box_of(chosen.system).half_widths))
+    return NOMINAL if chosen.name == "cube" else 2 * float(np.min(box_of(chosen.system).half_widths))
+
+
+def touching_height(chosen: Chosen) -> float:
+    """Height of the box's middle (m) at which a corner can touch: half of its diagonal."""
+    half = np.full(3, NOMINAL / 2) if chosen.name == "cube" else np.asarray(box_of(chosen.system).half_widths)
+    return float(np.linalg.norm(half))
 
 
 def estimate_table(report: TossReport, name: str) -> Table:
@@ -101,12 +110,12 @@ def measure(
     learned: LearnedToss,
     recording: Recording,
     protocol: Protocol,
-    width: float,
+    chosen: Chosen,
     baseline: LearnedToss | None = None,
 ) -> dict[str, Any]:
     """Predict every toss and print, write and draw how far off that is; against a `baseline` too, toss by toss."""
-    system = learned.system
-    data = protocol_starts(recording, protocol, width, moments_of(system))
+    system, width = learned.system, nominal_width(chosen)
+    data = protocol_starts(recording, protocol, touching_height(chosen), moments_of(system))
     predicted = learned.predict(data)
     errors = toss_errors(system, data, predicted, width)
     out: dict[str, Any] = {"protocol": protocol, "tosses": len(errors.position), **errors.summary()}

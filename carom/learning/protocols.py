@@ -47,14 +47,14 @@ def pose_errors(
 
 
 def protocol_starts(
-    recording: Recording, protocol: Protocol, width: float, moments: Float[np.ndarray, " 3"] | None = None
+    recording: Recording, protocol: Protocol, height: float, moments: Float[np.ndarray, " 3"] | None = None
 ) -> Recording:
     """The recording as a protocol predicts it: each toss from the sample that it starts from.
 
-    A: the first sample. B: the sample before the centre first falls below `sqrt(3) / 2 width`, the height at which a
-    corner can touch, with the velocities refitted on the flight before it (Acosta, Yang, Posa, RA-L 2022). In flight a
-    body keeps its angular momentum, for which its second `moments` are needed, but for a common factor; without them
-    it turns like a cube, at one rate.
+    A: the first sample. B: the sample before the centre first falls below `height` (m), at which a corner can touch
+    (half of the box's diagonal), with the velocities refitted on the flight before it (Acosta, Yang, Posa, RA-L 2022).
+    In flight a body keeps its angular momentum, for which its second `moments` are needed, but for a common factor;
+    without them it turns like a cube, at one rate.
     """
     require(protocol in ("A", "B"), f"protocol must be A or B; it was {protocol!r}.")
     if protocol == "A":
@@ -63,7 +63,7 @@ def protocol_starts(
     inertia = np.sum(second) - second  # I_x = mu_y + mu_z and so on
     starts, states = [], []
     for k, length in enumerate(recording.length):
-        low = recording.x[k, :length, 0, 2] < np.sqrt(3) / 2 * width
+        low = recording.x[k, :length, 0, 2] < height
         start = max(int(low.argmax()) - 1, 0) if low.any() else 0
         starts.append(start)
         states.append(_flight_velocity(recording.x[k, : start + 1], recording.v[k, start], recording.dt, inertia))
