@@ -1,5 +1,8 @@
 """Checks of arguments: what is wrong is said at once, by name, where the values are known."""
 
+import importlib
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +33,28 @@ def require(condition: bool | np.bool_, message: str) -> None:
     """Raise `CaromError(message)` unless `condition`."""
     if not condition:
         raise CaromError(message)
+
+
+def optional_package(name: str, user: str, extra: str) -> Any:
+    """The package of this name, which `user` needs and the extra of carom brings.
+
+    **Raises:** `CaromError` that says how to get it, or, of one that is there, in its own words what is wrong with it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        missing = isinstance(error, ModuleNotFoundError) and error.name == name
+        own = " ".join(str(error).split())
+        raise CaromError(
+            f"{user} needs the package {name}, which is not installed: {install(extra)}."
+            if missing
+            else f"{user} needs the package {name}, which is installed but cannot be imported: {own}"
+        ) from error
+
+
+def install(extra: str) -> str:
+    """How to install an extra, as long as no package index has carom."""
+    return f"pip install '.[{extra}]' in a checkout of carom"
 
 
 def _show(value) -> str:

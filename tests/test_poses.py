@@ -65,6 +65,16 @@ def test_velocities_are_estimated_up_to_impacts(tosses):
     assert np.quantile(np.linalg.norm(velocity - true_velocity, axis=-1)[away], 0.9) < 0.05
 
 
+@pytest.mark.parametrize("rate", [2.0, 45.0])
+def test_rates_are_estimated_where_few_samples_turn_far(rate):
+    """At 30 Hz, 45 rad/s are 1.5 rad from sample to sample, and more than pi within the window of a parabola."""
+    axis, time = np.array([2.0, -1.0, 2.0]) / 3, np.arange(20) / 30
+    turns = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]) * Rotation.from_rotvec(rate * time[:, None] * axis)
+    position = np.zeros((1, 20, 3))
+    poses = PoseRecording.of(position, turns.as_quat(scalar_first=True)[None], dt=1 / 30)
+    assert np.allclose(with_velocities(poses).omega, rate * axis, atol=1e-6)
+
+
 def test_impacts_are_found_and_flight_ends_before_them(tosses):
     poses, contact = recorded(tosses), tosses[2]
     found = impacts(poses)

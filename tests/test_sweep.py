@@ -205,7 +205,7 @@ def test_other_settings_and_other_sweeps_are_refused(place, capsys):
     command("--over", "width=20", "--method", "grid")
     for words, text in (
         (("--over", "width=20,21", "--method", "grid"), "was started with over = ['width=20'], not ['width=20', "),
-        (("--over", "width=20", "--method", "grid", "--epochs", "3"), "was started with config"),
+        (("--over", "width=20", "--method", "grid", "--epochs", "3"), "was started with epochs = "),
         (("--over", "width=20", "--method", "grid", "--workers", "0"), "workers must be at least 1"),
     ):
         with pytest.raises(SystemExit):

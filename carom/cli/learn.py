@@ -182,30 +182,40 @@ class Learn:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
         self.tosses.check()
         require(self.process_count == 1, f"--process-count must be 1 for recorded tosses; it was {self.process_count}.")
-        folder = RunFolder.choose(self.out, f"{self.task}-tosses", resume=self.resume)
+        folder = RunFolder.choose(self.out, f"{chosen.stem}-tosses", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
-        data = load_recording(self.data or "", task=self.task)
-        if self.val is None:
-            count = data.n_trajectories
-            require(count >= 2, f"--data must hold at least 2 tosses, or --val others; it held {count}.")
-            parts = Dataset.split(data, seed=self.config.seed)
-            data, val = parts.train, parts.val
-        else:
-            val = load_recording(self.val, task=self.task)
+        train, test = self._toss_data(console, chosen)
         settings = {**self._description(chosen), "tosses": dataclasses.asdict(self.tosses)}
         if self.resume:
             run = RunFolder.open(folder)
             run.check_same(settings)
         else:
             run = RunFolder.create(folder, settings)
-        save_recording(run.path / TEST_DATA, val)
+        # Resumed too: a kill may have come before them.
+        if chosen.source is not None:
+            write_whole(run.path / SYSTEM, chosen.source)
+        save_recording(run.path / TEST_DATA, test)
         console.print(
-            f"Learning {self.task} from {data.n_trajectories} recorded tosses into {run.path}",
+            f"Learning {chosen.name} from {train.n_trajectories} recorded tosses into {run.path}",
             soft_wrap=True,
             highlight=False,
         )
-        learn_and_measure(console, run, chosen.system, data, val, self.tosses)
+        learn_and_measure(console, run, chosen, train, test, self.tosses)
+
+    def _toss_data(self, console: Console, chosen: Chosen) -> tuple[Recording, Recording]:
+        """Tosses to learn from and to measure on: the fit needs none to validate on, so that either file will do."""
+        assert self.data is not None
+        data = load_recording(self.data, task=chosen.task)
+        held = self.test or self.val
+        if self.test is not None and self.val is not None:
+            console.print(f"Recorded tosses are learned without validation: {self.val} is not used.", highlight=False)
+        if held is None:
+            count = data.n_trajectories
+            require(count >= 2, f"--data must hold at least 2 tosses, or --val others; it held {count}.")
+            parts = Dataset.split(data, seed=self.config.seed)
+            return parts.train, parts.val
+        return data, load_recording(held, task=chosen.task)
 
     def _chosen(self) -> Chosen:
         """The system to learn, under the name that it was first given."""

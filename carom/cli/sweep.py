@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from carom.atomic import write_whole
-from carom.checks import require
+from carom.checks import optional_package, require
 from carom.cli.arguments import FilePath, FolderPath, SystemName
 from carom.cli.learn import Learn
 from carom.cli.search_space import Space, grid, parse_space, words_of
@@ -77,10 +77,7 @@ class Sweep:
 
     def run(self) -> None:
         """Do it."""
-        try:
-            import optuna
-        except ImportError as error:
-            raise CaromError("carom sweep needs optuna: pip install 'carom[sweep]'.") from error
+        optuna = optional_package("optuna", "carom sweep", "sweep")
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         for name in ("trials", "workers"):
             require(getattr(self, name) >= 1, f"--{name} must be at least 1; it was {getattr(self, name)}.")

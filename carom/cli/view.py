@@ -16,12 +16,15 @@ from rich.console import Console
 from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.outcome import TEST_DATA, one_of
-from carom.cli.systems import chosen_by, data_and_system
+from carom.cli.systems import Chosen, choose, chosen_by, data_and_system
+from carom.cli.tosses import LearnedToss
 from carom.errors import CaromError
 from carom.learning.dataset import trajectory_of
 from carom.learning.evaluate import predict
 from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.protocols import body_points
 from carom.learning.run import CONFIG, MODEL, RunFolder
+from carom.learning.tosses import COMPENSATION, toss_motions
 from carom.simulation.files import load_recording
 from carom.simulation.impact import COMPENSATION_STEPS
 from carom.simulation.recording import Recording, check_system
@@ -90,7 +93,9 @@ class View:
 
     def _run_folder(self) -> "_Shown":
         run = RunFolder.open(self.run_or_file)
-        chosen, name = chosen_by(run), run.read_json(CONFIG)["task"]
+        chosen, config = chosen_by(run), run.read_json(CONFIG)
+        if config.get("tosses") is not None:
+            return self._tosses(run, chosen, config["task"])
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, chosen.system)
         test = self._some(load_recording(run.path / TEST_DATA, task=chosen.task))
@@ -100,7 +105,19 @@ class View:
             (true, one_of(found, k, len(true.time)))
             for k, true in enumerate(trajectory_of(test, k) for k in range(test.n_trajectories))
         ]
-        return _Shown(system, pairs, f"{name}: true and predicted", compensation)
+        return _Shown(system, pairs, f"{config['task']}: true and predicted", compensation)
+
+    def _tosses(self, run: RunFolder, chosen: Chosen, name: str) -> "_Shown":
+        """Predictions as they were measured, of the body's own points: recordings are of the middle of its box."""
+        learned = LearnedToss.of_run(run.path)
+        test = self._some(load_recording(run.path / TEST_DATA, task=chosen.task))
+        found = toss_motions(learned.system, test, substeps=learned.substeps)
+        pairs = []
+        for k, recorded in enumerate(trajectory_of(test, k) for k in range(test.n_trajectories)):
+            x, v = (body_points(learned.system, part) for part in (recorded.x, recorded.v))
+            true = dataclasses.replace(recorded, x=x, v=v)
+            pairs.append((true, one_of(found, k, len(true.time))))
+        return _Shown(learned.system.with_max_active(4), pairs, f"{name}: true and predicted", COMPENSATION)
 
     def _file(self, console: Console) -> "_Shown":
         recording, chosen, word = data_and_system(self.run_or_file, self.task)

@@ -275,12 +275,23 @@ def with_velocities(poses: PoseRecording) -> PoseRecording:
                 near = np.array([max(t - 1, 0), max(t - 1, 0) + 1])
             time = (near - t) * poses.dt
             basis = np.stack([time**j for j in range(min(3, len(near)))], axis=1)
-            turned = _body_turn(np.broadcast_to(poses.quaternion[k, t], (len(near), 4)), poses.quaternion[k, near])
+            turned, rate = _turns_about_mean(poses.quaternion[k, near], time)
             both = np.concatenate([poses.position[k, near], turned], axis=1)
             slope = np.linalg.lstsq(basis, both, rcond=None)[0][1]
-            velocity[k, t], omega[k, t] = slope[:3], slope[3:]
+            velocity[k, t], omega[k, t] = slope[:3], slope[3:] + rate
     held = (_hold_last(part, poses.length) for part in (velocity, omega))
     return eqx.tree_at(lambda p: (p.velocity, p.omega), poses, tuple(held), is_leaf=lambda part: part is None)
+
+
+def _turns_about_mean(quaternion: Float[np.ndarray, "m 4"], time: Float[np.ndarray, " m"]):
+    """Rotation vectors in the frame of the body at time 0, beyond those of turning at the mean rate; and that rate.
+
+    Those alone would lose whole turns: a rotation vector has at most half a turn.
+    """
+    rate = np.mean(_body_turn(quaternion[:-1], quaternion[1:]), axis=0) / (time[1] - time[0])
+    turns = Rotation.from_quat(quaternion, scalar_first=True)
+    start = turns[int(np.argmin(np.abs(time)))]
+    return (Rotation.from_rotvec(-rate * time[:, None]) * start.inv() * turns).as_rotvec(), rate
 
 
 def _body_turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
