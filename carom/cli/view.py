@@ -16,7 +16,7 @@ from rich.console import Console
 from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.outcome import TEST_DATA, one_of
-from carom.cli.systems import Chosen, choose, chosen_by, data_and_system
+from carom.cli.systems import Chosen, chosen_by, data_and_system
 from carom.cli.tosses import LearnedToss
 from carom.errors import CaromError
 from carom.learning.dataset import trajectory_of

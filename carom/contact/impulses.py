@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, is_share, not_negative, positive, require, require_values
 from carom.contact.candidates import Active
 from carom.contact.lcp import solve_lcp_impulse
 from carom.contact.phases import two_phases
@@ -74,7 +74,7 @@ class CMr(ContactModel):
     def __init__(self, epsilon: ArrayLike = 0.01):
         epsilon = as_floats(epsilon)
         require(epsilon.ndim == 0, f"epsilon must be one number; its shape was {epsilon.shape}.")
-        require_values("epsilon", epsilon, (epsilon >= 0) & jnp.isfinite(epsilon), "a finite number of at least 0")
+        require_values("epsilon", epsilon, not_negative, "a finite number of at least 0")
         self.epsilon = epsilon
 
     def __call__(self, state, *, smoothing=0.0):
@@ -125,7 +125,7 @@ class Coulomb(ContactModel):
             value = getattr(self, name)
             require(value.shape == (), f"{name} must be one number; its shape was {value.shape}.")
             speed = name == "loss_speed"
-            good = (value > 0) & jnp.isfinite(value) if speed else (value >= 0) & (value <= 1)
+            good = positive if speed else is_share
             require_values(name, value, good, "a positive speed in m/s" if speed else "a share from 0 to 1")
         require(iterations >= 1, f"iterations must be at least 1; it was {iterations}.")
         self.iterations = iterations

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from carom.checks import is_known, require, require_values
+from carom.checks import is_known, not_negative, require, require_values
 from carom.contact.cones import ConeSettings, ConeSolution, solve_cone_problem
 
 
@@ -60,7 +61,7 @@ def contact_impulse(
     **Source:** paper, S.14 and S.15.
     """
     _check_problem(A, v, friction=friction, restitution=restitution, v_star=v_star)
-    require_values("restitution", restitution, restitution <= 1, "between 0 and 1")
+    require_values("restitution", restitution, lambda e: e <= 1, "between 0 and 1")
     compression, rebound = two_phases(A, v, friction, restitution, v_star, smoothing=smoothing)
     _check_solved(compression, v.dtype)
     _check_solved(rebound, v.dtype)
@@ -163,9 +164,9 @@ def _check_problem(A, v, *, friction, **others):
             value.shape == shape, f"{name} must have the shape {shape} to go with v {v.shape}; it was {value.shape}."
         )
     for name, value in {"A": A, "v": v, "friction": friction, **others}.items():
-        require_values(name, value, jnp.isfinite(value), "finite")
+        require_values(name, value, np.isfinite, "finite")
         if name not in ("A", "v", "v_star"):
-            require_values(name, value, value >= 0, "at least 0")
+            require_values(name, value, not_negative, "at least 0")
 
 
 def _check_solved(solution: ConeSolution, dtype):

@@ -20,7 +20,7 @@ from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
 
 LOOSE = 1e-3
-"""Constraints that are off by more (m^2) deserve a look; `learn` refuses what is off by `LARGEST_DRIFT`."""
+"""Constraints that are off by more, relative to what they hold, deserve a look; see `LARGEST_DRIFT`."""
 
 
 class Inspection(NamedTuple):
@@ -58,11 +58,11 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
 
 
 def _constraints(recording: Recording, system: System) -> Finding:
-    off = np.abs(np.asarray(system.constraints(jnp.asarray(recording.x[recording.valid]))))
+    off = np.abs(np.asarray(system.violation(jnp.asarray(recording.x[recording.valid]))))
     worst = float(off.max(initial=0.0))
     advice = "" if worst <= LOOSE else "lengths of rods, units or the order of points may be wrong"
     advice += "; `learn` refuses it" if worst > LARGEST_DRIFT else ""
-    return Finding("rods and joints are off by", f"{worst:.1e} m^2, median {np.median(off):.0e}", advice)
+    return Finding("rods and joints are off by", f"{worst:.1e} of what they hold, median {np.median(off):.0e}", advice)
 
 
 def _depth(recording: Recording, system: System) -> Finding:
@@ -70,8 +70,9 @@ def _depth(recording: Recording, system: System) -> Finding:
     reach, deepest, place, states = np.asarray(system.reach()), 0.0, "", 0
     count = 0
     for k, (gaps, length) in enumerate(zip(all_gaps(recording.x, system), recording.length, strict=True)):
-        share = -gaps[:length] / reach
-        states += int((share > 0).any(axis=1).sum())
+        depth = -gaps[:length]
+        states += int((depth > 0).any(axis=1).sum())
+        share = np.divide(depth, reach, out=np.zeros_like(depth), where=reach > 0)  # points have none
         count += int(length)
         if share.max(initial=0.0) > deepest:
             deepest = float(share.max())

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.checks import require
+from carom.checks import positive, require, require_values
 from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
 from carom.simulation.integrators import RK4, flow
@@ -24,12 +24,12 @@ COMPENSATION_STEPS = 8.0
 """Time steps over which a penetration is undone, by default (paper, appendix G)."""
 
 
-def check_compensation_steps(steps: float | None) -> None:
+def check_compensation_steps(steps: float | Float[Array, ""] | None) -> None:
     """Raise `CaromError` unless `steps` is a positive number, or `None` for no compensation."""
-    require(
-        steps is None or 0 < steps < np.inf,
-        f"compensation_steps must be a positive number, or None for no compensation; it was {steps}.",
-    )
+    if steps is None:
+        return
+    require(np.shape(steps) == (), f"compensation_steps must be one number; its shape was {np.shape(steps)}.")
+    require_values("compensation_steps", steps, positive, "a positive number, or None for no compensation")
 
 
 def _as_steps(steps) -> Float[Array, ""] | None:
