@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from carom.checks import as_floats, is_known, require, require_values
+from carom.checks import as_floats, at_once_if_known, is_share, not_negative, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
 from carom.contact.impulses import ContactModel, contact_model_of
 from carom.mechanics.bodies import (
@@ -23,7 +23,6 @@ from carom.mechanics.bodies import (
 )
 from carom.mechanics.constraints import Constraint, Rigid
 from carom.mechanics.potentials import NoPotential, Potential
-
 
 Compensation = Literal["mass", "paper"]
 """How steps undo penetration, and whether contact that lasts acts over them: see docs/contact.md."""
@@ -49,17 +48,17 @@ class System(eqx.Module):
     - `constraints`: `Distance`, `Tether`, `Joint`, `Pivot`, `Angles`, `Track` objects between points; a rigid body's
       own are added.
     - `contacts`: `DiskDisk`, `DiskPlane`, `RimPlane`, `CornerPlane`, `BallPlane`, `BallBall`, `BendLimit`,
-      `StretchLimit` objects.
+      `StretchLimit` objects; those without a contact are left out.
     - `potential`: a `Potential`, such as `Gravity((0., -9.81))`; none by default.
     - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers
       to them by its `property` index; a single number is shared by all.
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
       candidates, or twice as many as points where that is less: more are an error, never dropped.
-    - `contact_model`: how closed contacts change the velocity: `"coulomb"`, `"cm"` (the paper's), `"cmr"`, `"lcp"`, or a
-      `ContactModel`.
+    - `contact_model`: how closed contacts change the velocity: `"coulomb"`, `"cm"` (the paper's), `"cmr"`, `"lcp"`, or
+      a `ContactModel`.
     - `compensation`: `"mass"`: contact that lasts acts over the whole step, and penetration is undone by moving bodies,
-      in the metric of the mass and without work. `"paper"`: contact acts at the end of a step, and penetration is undone
-      by a velocity (appendix G), as the paper's tasks have it.
+      in the metric of the mass and without a velocity. `"paper"`: contact acts at the end of a step, and penetration is
+      undone by a velocity (appendix G), as the paper's tasks have it.
     - `step_model`: a law for a whole step that replaces forces, constraints and the contact model; none by default.
     - `dim`: 2 or 3, needed only where neither the potential, a contact nor a rigid body tells.
     - `name`: the task's name, for a task's system.
@@ -100,12 +99,14 @@ class System(eqx.Module):
         name: str = "",
     ):
         require(len(bodies) > 0, "bodies must hold at least one body; it was empty.")
-        self.bodies, self.contacts, self.name = tuple(bodies), tuple(contacts), name
+        # A family without a contact is nothing.
+        self.bodies, self.name = tuple(bodies), name
+        self.contacts = tuple(contact for contact in contacts if contact.property_index)
         self.potential = NoPotential() if potential is None else potential
         self.contact_model = contact_model_of(contact_model)
         self.step_model = step_model
         self.compensation = _compensation_of(compensation)
-        self.dim = _dimension(self.bodies, self.contacts, self.potential, dim)
+        self.dim = _dimension(self.bodies, contacts, self.potential, dim)
         table = self.table
         rigid = [
             Rigid(first, self.dim)
@@ -226,6 +227,38 @@ class System(eqx.Module):
             return jnp.zeros(0, x.dtype)
         return jnp.concatenate([link(x) for link in self.links])
 
+    def violation(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t E"]:
+        """`Phi(x)` relative to what each constraint holds: twice the share of its length that a rod is off by."""
+        if x.ndim > 2:
+            return jax.vmap(self.violation)(x)
+        if not self.links:
+            return jnp.zeros(0, x.dtype)
+        size, body_sizes, owner = self.size(x), self._body_sizes(), self._owners()
+        parts = []
+        for link in self.links:
+            own = jnp.max(body_sizes[np.array([owner[p] for p in link.points()])])
+            phi = link(x)
+            scale = jnp.asarray(link.size(jnp.where(own > 0, own, size)), x.dtype)
+            parts.append(phi / jnp.where(scale > 0, scale, 1))
+        return jnp.concatenate(parts)
+
+    def size(self, x: Float[Array, "n d"]) -> Float[Array, ""]:
+        """A length (m) to compare lengths with: of the largest body, else how far bodies are apart, or from 0."""
+        centers = x[jnp.array(self.table.center)]
+        apart = jnp.max(jnp.linalg.norm(centers - centers[0], axis=1))
+        largest = jnp.max(self._body_sizes()).astype(x.dtype)
+        rest = jnp.where(apart > 0, apart, jnp.max(jnp.linalg.norm(centers, axis=1)))
+        return jnp.asarray(jnp.where(largest > 0, largest, rest))
+
+    def _body_sizes(self) -> Float[Array, " bodies"]:
+        """The larger of radius and radius of gyration (m) of each body; 0 for points."""
+        turning = [jnp.sqrt(jnp.sum(b.moments) / b.mass) if isinstance(b, RigidBody) else 0 for b in self.bodies]
+        return jnp.stack([jnp.maximum(b.radius, k) for b, k in zip(self.bodies, turning, strict=True)])
+
+    def _owners(self) -> list[int]:
+        """The body that each point belongs to."""
+        return [k for k, body in enumerate(self.bodies) for _ in range(body.n_points(self.dim))]
+
     # --- contact ----------------------------------------------------------------------------------------------
 
     def candidates(self, x: Float[Array, "n d"]) -> Candidates:
@@ -282,23 +315,25 @@ def _dimension(bodies, contacts, potential, dim) -> int:
 
 
 def _properties(friction, restitution, index):
-    friction, restitution = jnp.atleast_1d(as_floats(friction)), jnp.atleast_1d(as_floats(restitution))
-    count = max(friction.shape[0], restitution.shape[0])
-    if friction.shape[0] == 1:
-        friction = jnp.broadcast_to(friction, (count,))
-    if restitution.shape[0] == 1:
-        restitution = jnp.broadcast_to(restitution, (count,))
+    friction, restitution = as_floats(friction), as_floats(restitution)
+    with at_once_if_known(friction, restitution):
+        friction, restitution = jnp.atleast_1d(friction), jnp.atleast_1d(restitution)
+        count = max(friction.shape[0], restitution.shape[0])
+        if friction.shape[0] == 1:
+            friction = jnp.broadcast_to(friction, (count,))
+        if restitution.shape[0] == 1:
+            restitution = jnp.broadcast_to(restitution, (count,))
     require(
         friction.shape == restitution.shape and friction.ndim == 1,
         f"friction and restitution must have one value for each property; they had {friction.shape[0]} and "
         f"{restitution.shape[0]}.",
     )
-    require_values("friction", friction, friction >= 0, "at least 0 (Coulomb's mu)")
-    require_values("restitution", restitution, (restitution >= 0) & (restitution <= 1), "between 0 and 1")
-    if is_known(friction):
-        require(
-            index.size == 0 or bool(index.min() >= 0 and index.max() < count),
-            f"a contact's property index must be below the number of friction values ({count}); one was "
-            f"{index.max() if index.size else 0}. Give one friction and restitution for each property.",
-        )
+    require_values("friction", friction, not_negative, "at least 0 (Coulomb's mu), and finite")
+    require_values("restitution", restitution, is_share, "between 0 and 1")
+    wrong = index[(index < 0) | (index >= count)]
+    require(
+        wrong.size == 0,
+        f"a contact's property index must be below the number of friction values ({count}); one was "
+        f"{wrong[0] if wrong.size else 0}. Give one friction and restitution for each property.",
+    )
     return friction, restitution

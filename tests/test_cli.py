@@ -346,3 +346,38 @@ def test_the_program_to_start_from_runs(tmp_path):
     found = re.findall(r"restitution 1: (\S+) .* identified", done.stdout)
     assert float(found[0]) == pytest.approx(0.5, abs=1e-3)
     assert Path("motions.csv").exists()
+
+
+def test_xla_logs_nothing_but_fatal_errors_unless_asked(monkeypatch):
+    """JAX leaves 1, its own level, to commands that are started by a program which uses it."""
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
+    command("--debug", "new", "one.py")
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "1"
+    command("new", "two.py")
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+
+
+CACHED = """
+import sys
+from carom.cli.main import main
+
+main(["new", *sys.argv[1:]])
+import jax
+
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+print(jax.jit(lambda x: 2 * x)(1.0))
+"""
+
+
+def test_programs_from_the_cache_are_loaded_without_a_word():
+    environment = {
+        **os.environ,
+        "TF_CPP_MIN_LOG_LEVEL": "1",
+        "CAROM_CACHE": "cache",
+        "PYTHONPATH": str(Path(carom.__file__).parents[1]),
+    }
+    for name in ("one.py", "two.py"):
+        words = [sys.executable, "-c", CACHED, name]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+        assert done.stderr == ""
+    assert list(Path("cache").glob("*/*-cache"))

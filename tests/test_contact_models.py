@@ -41,6 +41,7 @@ def state_of(problem) -> carom.ContactState:
             gap=jnp.asarray(-ones),
             jacobian=jnp.zeros((batch, k, d, k, d)),
             property_index=jnp.zeros((batch, k), int),
+            candidate=jnp.broadcast_to(jnp.arange(k), (batch, k)),
             closed=jnp.asarray(present),
             overflow=jnp.zeros(batch, int),
         ),

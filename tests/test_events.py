@@ -372,6 +372,66 @@ def test_fast_bodies_do_not_pass_through_each_other():
 
 @pytest.mark.slow
 @pytest.mark.ci_budget
+def test_balls_that_fly_many_times_their_size_in_a_step_meet():
+    """They exchange velocities at any speed; one that passes by is left alone."""
+    system = carom.System(
+        bodies=[carom.PointMass(1.0, 0.02), carom.PointMass(1.0, 0.01)],
+        contacts=[carom.DiskDisk([(0, 1)])],
+        friction=0.0,
+        restitution=1.0,
+        dim=2,
+    )
+    speed, dt = np.array([5.0, 500.0, 5e3, 5e5]), 0.01
+    x0 = np.zeros((5, 2, 2))
+    x0[:4, 0, 0], x0[4, 0] = -0.4567 * speed * dt - 0.03, [-20, 0.031]
+    v0 = np.zeros((5, 2, 2))
+    v0[:, 0, 0] = [*speed, 5e3]
+    out = carom.simulate(system, jnp.asarray(x0), jnp.asarray(v0), dt=dt, steps=2, impact="event")
+    for k in range(4):
+        assert np.allclose(out.v[k, -1], v0[k, ::-1], atol=1e-9 * speed[k])
+        # They meet after 0.4567 of a step, with the centres 0.03 apart.
+        assert np.allclose(out.x[k, -1, :, 0], [-0.03, (2 - 0.4567) * speed[k] * dt], rtol=1e-9, atol=1e-9 * speed[k])
+    assert np.allclose(out.v[4, -1], v0[4])
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+def test_what_cannot_be_looked_at_is_an_error():
+    """Two balls fly side by side, 10^5 times their size in a step: whether they touch on the way cannot be told."""
+    system = carom.System(
+        bodies=[carom.PointMass(1.0, 0.01)] * 2,
+        contacts=[carom.DiskDisk([(0, 1)])],
+        friction=0.0,
+        restitution=1.0,
+        dim=2,
+    )
+    x0, v0 = jnp.array([[0.0, 0.0], [0.0, 0.021]]), jnp.array([[1e5, 0.0], [1e5, 0.0]])
+    with refused("bodies move so far in a time step, beside their size, that it cannot be told which of them meet"):
+        carom.simulate(system, x0, v0, dt=0.01, steps=2, impact="event")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e-3, 1e-6])
+def test_events_are_the_same_at_every_scale(scale):
+    """Lengths times s, times by its root, masses by its cube: a ball that bounces on another and on the floor."""
+
+    def moved(s):
+        system = carom.System(
+            bodies=[carom.PointMass(s**3, 0.1 * s), carom.PointMass(0.5 * s**3, 0.1 * s)],
+            contacts=[carom.DiskDisk([(0, 1)]), carom.DiskPlane([0, 1], *FLOOR)],
+            potential=carom.Gravity((0.0, -GRAVITY)),
+            friction=0.3,
+            restitution=0.5,
+        )
+        x0, v0 = jnp.array([[0.0, 0.5], [0.05, 0.9]]) * s, jnp.array([[0.3, 0.0], [0.0, 0.0]]) * s**0.5
+        return carom.simulate(system, x0, v0, dt=0.01 * s**0.5, steps=150, impact="event").x / s
+
+    # Rounding, which impacts multiply.
+    assert np.allclose(moved(scale), moved(1.0), atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_what_rests_or_bounces_ever_faster_is_left_to_the_rule_of_the_step():
     """A ball that is dropped comes to rest: no hang, no sinking, no energy from nothing (Zeno)."""
     case = Case([[0.0, 0.2]], [[0.3, 0.0]], [], (FLOOR,), 0.1)

@@ -12,8 +12,10 @@ from systems import refused
 import carom
 from carom.learning.identify import identify
 from carom.learning.models import NeuralPotential
-from carom.learning.refine import choose_steps
+from carom.learning.parameters import unknowns_of
+from carom.learning.refine import Fit, choose_steps, polish
 from carom.learning.robust import Blocks, solve
+from carom.simulation.impact import Stepper
 
 CONTACT = ("friction", "restitution")
 
@@ -89,7 +91,69 @@ def test_no_rebound_bounds_restitution_from_above():
     assert estimate.lower == 0
     assert estimate.bound is not None
     assert 0 < estimate.bound < 0.05
-    assert estimate.verdict == "identified"
+    assert estimate.verdict == "bounded above"  # however tight: no impact tells the restitution itself
+    assert estimate.impacts == 0
+
+
+def bounced(n, friction=0.3, restitution=0.6):
+    """Throws as `throws` makes them, but in closed form: the ball meets the floor at its own time, between samples."""
+    rng, time, g = np.random.default_rng(0), 0.01 * np.arange(13), 9.81
+    y, down, along = rng.uniform(0.12, 0.2, (n, 1)), rng.uniform(1, 2, (n, 1)), rng.uniform(3.2, 4.8, (n, 1))
+    hit = (-down + np.sqrt(down**2 + 2 * g * (y - 0.1))) / g
+    speed = down + g * hit  # of the impact, which slides: 0.3 (1 + e) of it is less than the ball moves along
+    left, after = along - friction * (1 + restitution) * speed, time - hit
+    before = np.stack([along * time, y - down * time - g * time**2 / 2], axis=-1)
+    then = np.stack([along * hit + left * after, 0.1 + restitution * speed * after - g * after**2 / 2], axis=-1)
+    v_before = np.stack([along + 0 * time, -down - g * time], axis=-1)
+    v_then = np.stack([left + 0 * time, restitution * speed - g * after], axis=-1)
+    later = (after > 0)[..., None]
+    x, v = np.where(later, then, before), np.where(later, v_then, v_before)
+    return carom.Recording.of(x[:, :, None], v[:, :, None], dt=0.01)
+
+
+def test_impacts_that_no_sample_shows_tell_nothing(monkeypatch):
+    data, truth = bounced(40), ball()
+    with refused("impacts happen between the samples"):
+        identify(truth, data, learned=CONTACT)
+    # Even if that were not found out: the model predicts impacts, but the data have none.
+    monkeypatch.setattr("carom.learning.identify.check_meetings", lambda recording, system: None)
+    found = identify(truth, data, learned=CONTACT)
+    assert found.impacts == found.used == [0, 0]
+    assert {e.verdict for name in CONTACT for e in getattr(found, name)} == {"not identified"}
+    assert {e.impacts for name in CONTACT for e in getattr(found, name)} == {0}
+
+
+@pytest.mark.slow
+def test_fewer_than_ten_impacts_identify_nothing():
+    truth = ball()
+    data = throws(truth, 40, along=4.0)
+    few = data.select([k for k in range(40) if (data.x[k, 1:, 0, 1] < 0.1).any()][:9])
+    found = identify(truth, few, learned=CONTACT)
+    assert 0 < (found.friction[0].impacts or 0) <= 9
+    assert found.friction[0].verdict == found.restitution[0].verdict == "not identified"
+    assert found.friction[0].standard_error < 0.05  # it is their number
+
+
+@pytest.mark.slow
+def test_nothing_to_tell_of_the_mass_of_one_body():
+    """Its mass is the unit of all others: alone, no parameter is left."""
+    truth = ball()
+    found = identify(truth, throws(truth, 40, along=4.0), learned=("mass",))
+    assert found.mass_ratio == found.friction == found.restitution == []
+    assert found.used[0] >= 20
+
+
+def test_a_recording_that_is_never_free_of_contact_is_refused():
+    """Every state overlaps the floor, so that no step may be looked at."""
+    network = NeuralPotential(1, 2, width=8, depth=2, key=jax.random.key(0))
+    system = eqx.tree_at(lambda s: s.potential, ball(), network, is_leaf=lambda part: part is None)
+    x = np.full((3, 5, 1, 2), 0.09)
+    with refused("the recording has no step that starts without contact"):
+        identify(system, carom.Recording.of(x, np.zeros_like(x), dt=0.01))
+    flagged = carom.Recording.of(x, np.zeros_like(x), dt=0.01, contact=np.zeros((3, 5), bool))
+    unknowns = unknowns_of(system, ("potential",))
+    fit = polish(unknowns, system, Stepper(dt=jnp.asarray(0.01)), flagged, lambda unknowns: Fit(0.0, 0.0), 1.0)[1]
+    assert fit == Fit(np.inf, np.inf)
 
 
 def test_values_at_their_bounds_have_cut_off_intervals():
@@ -213,6 +277,14 @@ def test_robust_least_squares_ignores_outliers_and_knows_its_error():
     assert blocks is not None
     held = solve(blocks, np.eye(3), np.zeros(3), np.array([-1, -0.2, -1.0]), np.ones(3), redescend=True)
     assert held.change[1] == -0.2
+
+
+def test_least_squares_without_a_parameter_change_nothing():
+    blocks = Blocks(np.ones((7, 2)), np.zeros((7, 2, 0)), np.arange(7), np.zeros(7, int))
+    none = np.zeros(0)
+    out = solve(blocks, np.zeros((0, 0)), none, none, none, redescend=True)
+    assert out.change.shape == out.standard_error.shape == (0,)
+    assert out.weight.shape == (7,)
 
 
 def test_what_nearly_exact_data_do_not_tell_is_left_to_the_prior():

@@ -420,7 +420,7 @@ REFUSED = {
         arm('damping="1"').replace('name="j"', "").replace('name="arm"', ""),
         "damping (joint number 0 of body number 1; set it to 0)",
     ),
-    "several": (arm('damping="1" armature="1"'), 'ignore=("damping", "armature",)'),
+    "several": (arm('damping="1" armature="1"'), 'load_mujoco(..., ignore=("damping", "armature")).'),
     "nothing moves": (world('<geom size=".1"/>'), "the model has no joints: nothing in it moves"),
     "a rod without width": (
         world(
@@ -465,8 +465,10 @@ def test_named_kinds_are_left_out_knowingly():
         carom.load_mujoco(xml, ignore=("damping", "limits"))
     loaded = carom.load_mujoco(xml, ignore=("damping", "limits", "stiffness"))
     assert loaded.bodies == ("arm",)
-    with refused("ignore may name actuators, tendons, limits"):
-        carom.load_mujoco(xml, ignore=("dampings",))
+    for wrong in (("dampings",), "dampings"):
+        with refused("ignore may name actuators, tendons, limits") as error:
+            carom.load_mujoco(xml, ignore=wrong)
+        assert str(error.value).endswith("it named 'dampings'.")
 
 
 def test_what_mujoco_is_told_to_leave_out_is_not_refused():
@@ -483,7 +485,22 @@ def test_keyframes_that_there_are_not(keyframe):
 
 def test_without_mujoco_the_error_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with refused("load_mujoco needs the package mujoco, which is not installed: pip install 'carom[mujoco]'."):
+    with refused(
+        "load_mujoco needs the package mujoco, which is not installed: pip install '.[mujoco]' in a checkout of carom."
+    ):
+        carom.load_mujoco("model.xml")
+
+
+@pytest.mark.parametrize(
+    "failure",
+    ['ImportError("library 3.9\\n  for 4.0")', 'ModuleNotFoundError("library 3.9 for 4.0", name="mujoco._core")'],
+)
+def test_a_mujoco_that_cannot_be_imported_speaks_for_itself(tmp_path, monkeypatch, failure):
+    (tmp_path / "mujoco").mkdir()
+    (tmp_path / "mujoco" / "__init__.py").write_text(f"raise {failure}")
+    monkeypatch.delitem(sys.modules, "mujoco")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with refused("the package mujoco, which is installed but cannot be imported: library 3.9 for 4.0"):
         carom.load_mujoco("model.xml")
 
 
@@ -493,7 +510,7 @@ def test_the_example_of_the_documentation_works(capsys):
     names: dict = {}
     exec(compile(re.findall(r"```python\n(.*?)```", page, re.S)[0], "mujoco.md", "exec"), names)
     printed = capsys.readouterr().out
-    assert 'ignore=("damping",)' in printed
+    assert 'ignore="damping"' in printed
     assert "('upper', 'lower', 'crate')" in printed
     assert names["model"].properties == ("sphere 'hand' and plane 'floor'", "box 'crate' and plane 'floor'")
     np.testing.assert_allclose(names["model"].system.friction, [0.6, 1.0])

@@ -3,10 +3,12 @@
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 from test_cli import TINY, command, refused
 
 import carom
@@ -78,8 +80,44 @@ def recorded(path, count=8):
 
 
 def test_what_an_own_system_needs(capsys):
-    assert "data is needed for mine.py" in refused(capsys, "learn", "mine.py")
-    assert "initial is needed for mine.py" in refused(capsys, "simulate", "mine.py")
+    assert "data is needed for mine.py: give a trajectory file to learn from, --data FILE" in refused(
+        capsys, "learn", "mine.py"
+    )
+    assert "to start from its first states, --initial FILE" in refused(capsys, "simulate", "mine.py")
+
+
+def falling(task="", count=1, states=200):
+    """A file of a ball that falls past the floor's edge."""
+    time = 0.01 * np.arange(states)
+    x = np.stack([0.3 * time, 9 + time - 4.905 * time**2], axis=1)[None, :, None] + np.zeros((count, 1, 1, 1))
+    v = np.stack([0.3 + 0 * time, 1 - 9.81 * time], axis=1)[None, :, None] + np.zeros((count, 1, 1, 1))
+    carom.save_recording("falling.h5", carom.Recording.of(x, v, dt=0.01, task=task))
+
+
+def test_one_recording_is_cut_with_a_word(capsys):
+    falling()
+    learn = Learn("mine.py", data=Path("falling.h5"))
+    dataset, test = learn.data_sets(choose("mine.py"), Console())
+    assert (dataset.train.n_trajectories, dataset.val.n_trajectories, test.n_trajectories) == (8, 1, 1)
+    assert "cut into 10 pieces of 20" in " ".join(capsys.readouterr().out.split())
+    falling(states=12)
+    with pytest.raises(carom.CaromError, match="too little to cut into pieces of 5"):
+        learn.data_sets(choose("mine.py"), Console())
+
+
+def test_check_goes_on_with_a_task_that_carom_does_not_have(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    falling(task="my-lab")
+    command("check", "falling.h5")
+    out = " ".join(capsys.readouterr().out.split())
+    assert "is of 'my-lab', which is no task of carom's. Give --task NAME, or --task FILE.py" in out
+    assert "recording.cut(samples)" in out
+    command("check", "falling.h5", "--task", "mine.py", "--no-tell")
+    assert "impacts of property 0" in " ".join(capsys.readouterr().out.split())
+    command("check", "falling.h5", "--task", "bounce-once", "--no-tell")
+    assert "says that it is of 'my-lab'; it is taken as of 'bounce-once'" in " ".join(capsys.readouterr().out.split())
+    assert "is no task of carom's. Give --task NAME" in refused(capsys, "view", "falling.h5")
+    assert "task must be one of" in refused(capsys, "check", "falling.h5", "--task", "nope")
 
 
 @pytest.mark.slow

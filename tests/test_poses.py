@@ -65,6 +65,16 @@ def test_velocities_are_estimated_up_to_impacts(tosses):
     assert np.quantile(np.linalg.norm(velocity - true_velocity, axis=-1)[away], 0.9) < 0.05
 
 
+@pytest.mark.parametrize("rate", [2.0, 45.0])
+def test_rates_are_estimated_where_few_samples_turn_far(rate):
+    """At 30 Hz, 45 rad/s are 1.5 rad from sample to sample, and more than pi within the window of a parabola."""
+    axis, time = np.array([2.0, -1.0, 2.0]) / 3, np.arange(20) / 30
+    turns = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]) * Rotation.from_rotvec(rate * time[:, None] * axis)
+    position = np.zeros((1, 20, 3))
+    poses = PoseRecording.of(position, turns.as_quat(scalar_first=True)[None], dt=1 / 30)
+    assert np.allclose(with_velocities(poses).omega, rate * axis, atol=1e-6)
+
+
 def test_impacts_are_found_and_flight_ends_before_them(tosses):
     poses, contact = recorded(tosses), tosses[2]
     found = impacts(poses)
@@ -155,6 +165,18 @@ def test_pose_files(tmp_path, tosses, suffix, ragged):
     again = carom.load_recording(tmp_path / "out.h5", task="cube")
     assert (again.group is None) == (not ragged)
     assert np.array_equal(again.length, recording.length)
+
+
+@pytest.mark.parametrize("decimals", [3, 4, 6])
+def test_times_of_poses_may_be_rounded(tmp_path, tosses, decimals):
+    arrays = content(tosses)
+    times = np.round(1.7e9 + np.arange(61) / 120, decimals)
+    del arrays["dt"]
+    np.savez(tmp_path / "poses.npz", **arrays, time=times)
+    assert abs(load_poses(tmp_path / "poses.npz")[0].dt - 1 / 120) < 2 * 10.0**-decimals / 61
+    np.savez(tmp_path / "gap.npz", **arrays, time=times + (times > times[30]))
+    with refused("time must have equal steps; that after sample 30 was 1.008"):
+        load_poses(tmp_path / "gap.npz")
 
 
 BROKEN = {

@@ -1,5 +1,7 @@
 """Simulation with contact: recorded references, closed forms, conserved quantities, bad input."""
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -173,6 +175,48 @@ def test_more_contacts_than_places_are_an_error():
         carom.simulate(system, x0, v0, dt=0.01, steps=1)
     silent = carom.simulate(system, x0, v0, dt=0.01, steps=1, throw=False)
     assert silent.overflow.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("narrow", ["system", "x0", "v0", "force"])
+def test_mixed_precision_is_computed_in_the_widest(narrow):
+    """As if the narrow part had been given in double precision; all numbers are exact in single."""
+    given = {"system": ball_on_floor(radius=0.125, gravity=8.0), "x0": jnp.array([[0.0, 0.5]])}
+    given |= {"v0": jnp.array([[1.0, -0.5]]), "force": jnp.ones((2, 1, 2))}
+    single = jax.tree.map(lambda a: a.astype(jnp.float32) if eqx.is_array(a) else a, given[narrow])
+    out = carom.simulate(**given | {narrow: single}, dt=0.01, steps=2)
+    assert out.x.dtype == out.residual.dtype == jnp.float64
+    assert np.array_equal(out.x, carom.simulate(**given, dt=0.01, steps=2).x)
+
+
+@pytest.mark.parametrize(
+    "solver", [diffrax.SemiImplicitEuler(), diffrax.Kvaerno3(), diffrax.LeapfrogMidpoint(), diffrax.ReversibleHeun()]
+)
+def test_other_solvers_than_explicit_runge_kutta_methods_are_refused(solver):
+    with refused("solver must be an explicit Runge-Kutta method of diffrax, such as diffrax.Tsit5(), or carom.RK4()"):
+        carom.simulate(ball_on_floor(), jnp.ones((1, 2)), jnp.ones((1, 2)), dt=0.01, steps=1, solver=solver)
+
+
+def test_shapes_of_numbers_are_checked():
+    state = jnp.ones((1, 2)), jnp.ones((1, 2))
+    with refused("dt must be one number of seconds; its shape was (1,)"):
+        carom.simulate(ball_on_floor(), *state, dt=jnp.array([0.01]), steps=1)
+    with refused("compensation_steps must be one number; its shape was (2,)"):
+        carom.simulate(ball_on_floor(), *state, dt=0.01, steps=1, compensation_steps=jnp.ones(2))
+
+
+@pytest.mark.parametrize("impact", ["step", "event"])
+def test_an_empty_batch_gives_no_trajectory(impact):
+    out = carom.simulate(ball_on_floor(), jnp.ones((0, 1, 2)), jnp.ones((0, 1, 2)), dt=0.5, steps=2, impact=impact)
+    assert out.x.shape == out.v.shape == (0, 3, 1, 2)
+    assert out.residual.shape == out.contact.shape == out.overflow.shape == (0, 3)
+    assert np.array_equal(out.time, [0, 0.5, 1])
+
+
+def test_the_residual_of_what_is_not_finite_is_not_finite():
+    """Also under jit, where a start cannot be refused; other members of the batch are what they are."""
+    x0 = jnp.array([[[0.0, 0.5]], [[jnp.nan, 0.5]]])
+    out = jax.jit(lambda x: carom.simulate(ball_on_floor(), x, jnp.zeros((2, 1, 2)), dt=0.01, steps=2))(x0)
+    assert np.array_equal(np.isfinite(out.residual), [[True] * 3, [False] * 3])
 
 
 def test_a_constant_force_accelerates():

@@ -7,6 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import refused
 
 import carom
 from carom.atomic import replacing, write_whole
@@ -128,6 +129,21 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path, run):
     (run.path / CONFIG).write_text("{")
     with pytest.raises(carom.CaromError, match="not valid JSON"):
         run.read_json(CONFIG)
+
+
+def test_settings_are_the_same_after_json_has_kept_them(tmp_path):
+    settings = {
+        "task": "cube",
+        "learn": ("mass",),
+        "limit": np.inf,
+        "tosses": {"horizons": (8, 16), "space": ((0.1, 1.0), None), "rounds": np.int64(3)},
+    }
+    run = RunFolder.create(tmp_path / "tosses", settings)
+    run.check_same({**settings, "started": "later"})
+    with refused("was started with horizons = [8, 16], not [8]. Use the same options"):
+        run.check_same({**settings, "tosses": {**settings["tosses"], "horizons": (8,)}})
+    with refused("was started with learn = ['mass'], not ['friction']"):
+        run.check_same({**settings, "learn": ("friction",)})
 
 
 def test_what_a_kill_left_is_removed_once_it_is_old(tmp_path):

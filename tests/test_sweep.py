@@ -177,6 +177,21 @@ def test_trials_that_fail(place, capsys):
     out = capsys.readouterr().out
     assert "failed: width must not be 13." in out
     assert [row["width"] for row in trials_of(place / "sweeps" / "mine")] == ["20"]
+    # The same again, now that what was wrong is put right: that training alone, in its folder.
+    (place / "train.py").write_text(TRAINING.replace("width == 13", "width == 14"))
+    command("--over", "width=13,20", "--method", "grid")
+    assert "2 trials, 1 of them finished" in capsys.readouterr().out
+    rows = [(row["width"], row["trial"]) for row in trials_of(place / "sweeps" / "mine")]
+    assert sorted(rows) == [("13", "trial-0000"), ("20", "trial-0001")]
+
+
+@pytest.mark.parametrize("method", ["tpe", "random"])
+def test_more_trials_draw_other_options(place, method):
+    """Values of a range, so that none comes twice by chance."""
+    for trials in ("2", "4"):
+        command("--over", "learning_rate=1e-4:1e-2:log", "--method", method, "--trials", trials)
+    rows = trials_of(place / "sweeps" / "mine")
+    assert len({row["learning_rate"] for row in rows}) == len(rows) == 4
 
 
 def test_a_sweep_that_can_only_fail_ends(place, capsys):
@@ -190,7 +205,7 @@ def test_other_settings_and_other_sweeps_are_refused(place, capsys):
     command("--over", "width=20", "--method", "grid")
     for words, text in (
         (("--over", "width=20,21", "--method", "grid"), "was started with over = ['width=20'], not ['width=20', "),
-        (("--over", "width=20", "--method", "grid", "--epochs", "3"), "was started with config"),
+        (("--over", "width=20", "--method", "grid", "--epochs", "3"), "was started with epochs = "),
         (("--over", "width=20", "--method", "grid", "--workers", "0"), "workers must be at least 1"),
     ):
         with pytest.raises(SystemExit):

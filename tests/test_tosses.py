@@ -2,25 +2,33 @@
 
 import csv
 import dataclasses
+import io
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from systems import ball_on_floor, refused
 
 import carom
 from carom.cli.main import main
+from carom.cli.systems import Chosen
+from carom.cli.tosses import _warn_if_far_off, nominal_width, touching_height
+from carom.cli.view import View
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
 from carom.learning.toss_parameters import CENTER, read_values, with_values
 from carom.learning.tosses import TossConfig, choose_segments, learn_tosses, predict_tosses, prepared
-from carom.mechanics.bodies import embed_pose, embed_velocity
+from carom.mechanics.bodies import embed_pose, embed_velocity, recover_velocity
 from carom.simulation.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
+HEIGHT = np.sqrt(3) / 2 * WIDTH
+"""Half of the diagonal."""
 NAMES = ("inertia", "friction", "restitution")
 CONFIG = TossConfig(
     learn_of_toss=NAMES,
@@ -124,6 +132,44 @@ def test_values_are_read_as_they_were_written(cube):
     assert np.allclose(read_values(changed, ("half_width", "inertia")), read_values(cube, ("half_width", "inertia")))
 
 
+def box_on_two_planes() -> carom.System:
+    """A box of unequal edges above a table and a wall, which have properties of their own."""
+    return carom.System(
+        bodies=[carom.RigidBody(0.4, (1e-4, 2e-4, 3e-4))],
+        contacts=[
+            carom.CornerPlane([0], (0.06, 0.03, 0.015), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), property=1),
+            carom.CornerPlane([0], (0.06, 0.03, 0.015), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), property=0),
+        ],
+        potential=carom.Gravity((0.0, 0.0, -9.81)),
+        friction=(0.5, 0.2),
+        restitution=(0.9, 0.1),
+    )
+
+
+def test_a_box_keeps_its_proportions_and_a_wall_its_properties():
+    box, names = box_on_two_planes(), ("half_width", "inertia", "friction", "restitution")
+    values = read_values(box, names)
+    assert np.allclose(values, [0.035, 4e-4, 0.2, 0.1])  # mean half width, mean moment of inertia, those of the table
+    same = with_values(box, names, jnp.asarray(values))
+    assert np.allclose(same.contacts[0].half_widths, (0.06, 0.03, 0.015), rtol=1e-12)
+    changed = with_values(box, names, jnp.asarray([0.07, 8e-4, 0.3, 0.4]))
+    assert np.allclose(changed.contacts[0].half_widths, (0.12, 0.06, 0.03))
+    assert np.allclose(changed.bodies[0].moments, (2e-4, 4e-4, 6e-4))
+    assert np.allclose(changed.friction, (0.5, 0.3))
+    assert np.allclose(changed.restitution, (0.9, 0.4))
+    assert np.allclose(read_values(changed, names), [0.07, 8e-4, 0.3, 0.4])
+
+
+def test_a_box_is_measured_from_where_its_corners_can_touch():
+    """sqrt(6^2 + 3^2 + 1.5^2) cm; errors are in % of its least width."""
+    chosen = Chosen("box.py", box_on_two_planes(), b"")
+    assert touching_height(chosen) == pytest.approx(0.01 * np.sqrt(36 + 9 + 2.25))
+    assert nominal_width(chosen) == pytest.approx(0.03)
+    cube = Chosen("cube", carom.task("cube"))
+    assert touching_height(cube) == pytest.approx(np.sqrt(3) / 2 * 0.1048)
+    assert nominal_width(cube) == 0.1048
+
+
 def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
     with refused("one rigid body with a CornerPlane"):
         learn_tosses(ball_on_floor(), tosses, CONFIG, progress=False)
@@ -168,6 +214,15 @@ def test_recordings_are_of_the_centre_of_the_box(cube):
     assert np.allclose(body_points(system, moving), v)
 
 
+def test_predictions_of_tosses_that_are_far_off_are_called_so(tosses):
+    """Off by less or more than a tenth of the mean distance from the start."""
+    way = np.linalg.norm(tosses.x[:, :, 0] - tosses.x[:, :1, 0], axis=-1).mean(axis=1)
+    for share, expected in ((0.09, False), (0.11, True)):
+        text = io.StringIO()
+        _warn_if_far_off(Console(file=text), tosses, share * way)
+        assert ("does not explain the data" in text.getvalue()) == expected
+
+
 def test_a_toss_counts_to_its_own_end(cube, tosses):
     short = carom.Recording.of(tosses.x, tosses.v, dt=DT, length=np.full(60, 10))
     x = tosses.x.copy()
@@ -176,20 +231,66 @@ def test_a_toss_counts_to_its_own_end(cube, tosses):
 
 
 def test_protocol_b_starts_where_a_corner_can_touch(tosses):
-    assert protocol_starts(tosses, "A", WIDTH) is tosses
-    data = protocol_starts(tosses, "B", WIDTH)
-    height = np.sqrt(3) / 2 * WIDTH
+    assert protocol_starts(tosses, "A", HEIGHT) is tosses
+    data = protocol_starts(tosses, "B", HEIGHT)
     started = tosses.length - data.length
     late = started > 0  # the others begin so low
     assert late.sum() > 50
-    assert np.all(data.x[late, 1, 0, 2] < height)
-    assert np.all(data.x[late, 0, 0, 2] >= height)
+    assert np.all(data.x[late, 1, 0, 2] < HEIGHT)
+    assert np.all(data.x[late, 0, 0, 2] >= HEIGHT)
     assert np.array_equal(data.x[0, 0], tosses.x[0, started[0]])
     # A long flight gives better velocities than one recorded sample.
     k = int(np.argmax(started))
     fallen = tosses.v[k, 0, 0] - np.array([0, 0, 9.61 * DT * started[k]])
     assert np.abs(data.v[k, 0, 0] - fallen).max() < 0.02
     assert np.array_equal(data.group, tosses.group)
+
+
+def flight(turns, velocity) -> carom.Recording:
+    """A body that falls past the height of protocol B while it turns (rotations (T, 3, 3)); no recorded velocity."""
+    time = DT * np.arange(len(turns))
+    center = np.array([0.0, 0.0, 0.4]) + velocity * time[:, None] - [0, 0, 4.905] * time[:, None] ** 2
+    x = np.asarray(embed_pose(jnp.asarray(center), jnp.asarray(turns)))[None]
+    return carom.Recording.of(x, np.zeros_like(x), dt=DT)
+
+
+@pytest.mark.parametrize("rate", [3.0, 60.0])
+def test_velocities_of_a_flight_with_many_turns(rate):
+    """At one rate, in closed form: 60 rad/s are .4 rad from sample to sample, and three turns before the start."""
+    axis, velocity = np.array([2.0, -1.0, 2.0]) / 3, np.array([0.3, -0.2, 1.0])
+    angles = rate * DT * np.arange(80)
+    turns = Rotation.from_rotvec(angles[:, None] * axis) * Rotation.from_euler("xyz", [0.3, -0.5, 1.0])
+    recording = flight(turns.as_matrix(), velocity)
+    data = protocol_starts(recording, "B", HEIGHT)
+    start = int(recording.length[0] - data.length[0])
+    assert start > 40
+    found = [np.asarray(part[0]) for part in recover_velocity(jnp.asarray(data.x[:, 0]), jnp.asarray(data.v[:, 0]))]
+    assert np.allclose(found[0], velocity - [0, 0, 9.81 * DT * start], atol=1e-9)
+    assert np.allclose(found[1], rate * axis, atol=1e-9)
+
+
+def test_velocities_of_a_flight_that_wobbles():
+    """Euler's equations of a body with unequal moments, integrated by scipy to 1e-10: it turns at no one rate."""
+    moments, start_rate = np.array([1.0, 2.0, 4.0]), np.array([20.0, 3.0, -4.0])
+    inertia = moments.sum() - moments
+
+    def change(_, state):
+        turn, rate = state[:9].reshape(3, 3), state[9:]
+        spin = np.cross(np.broadcast_to(rate, (3, 3)), np.eye(3)).T
+        return np.concatenate([(turn @ spin).ravel(), -np.cross(rate, inertia * rate) / inertia])
+
+    time = DT * np.arange(80)
+    first = np.concatenate([np.eye(3).ravel(), start_rate])
+    motion = solve_ivp(change, (0, time[-1]), first, t_eval=time, rtol=1e-10, atol=1e-10).y.T
+    turns, rates = motion[:, :9].reshape(-1, 3, 3), motion[:, 9:]
+    recording = flight(turns, np.array([0.0, 0.0, 1.0]))
+    data = protocol_starts(recording, "B", HEIGHT, moments)
+    start = int(recording.length[0] - data.length[0])
+    found = np.asarray(recover_velocity(jnp.asarray(data.x[:, 0]), jnp.asarray(data.v[:, 0]))[1][0])
+    true = turns[start] @ rates[start]
+    assert np.linalg.norm(true - turns[0] @ rates[0]) > 3
+    # Half steps are of second order: a share of (|omega| dt)^2 / 24, with |omega| dt = 0.14.
+    assert np.linalg.norm(found - true) < 1e-3 * np.linalg.norm(true)
 
 
 def test_paired_differences_know_sessions():
@@ -241,3 +342,62 @@ def test_from_a_pose_file_to_a_table(tosses, tmp_path, monkeypatch, capsys):
     assert {row["session"] for row in rows} == {"0", "1"}
     for name in ("tosses.png", "toss_errors.png", "prediction.gif", "model.carom", "toss_errors_A.csv"):
         assert (tmp_path / "run" / name).stat().st_size > 100
+
+
+OWN = """
+import carom
+
+system = carom.System(
+    bodies=[carom.RigidBody(0.37, (3.9e-4, 3.9e-4, 3.9e-4))],
+    contacts=[carom.CornerPlane([0], 0.05, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), center=(1e-3, 0.0, 2e-3))],
+    potential=carom.Gravity((0.0, 0.0, -9.61)),
+    friction=0.2,
+    restitution=0.2,
+)
+"""
+
+
+@pytest.mark.slow
+def test_tosses_of_an_own_system_are_learned_measured_and_seen_by_one_rule(tosses, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CAROM_CACHE", "")
+    monkeypatch.setattr("carom.cli.tosses._pictures", lambda *_: None)  # most of the time, three times
+    (tmp_path / "mine.py").write_text(OWN)
+    for name, part in (("train", tosses.select(slice(8))), ("test", tosses.select(slice(8, 13)))):
+        carom.save_recording(f"{name}.h5", dataclasses.replace(part, task=""))
+    words = ["learn", "mine.py", "--data", "train.h5", "--test", "test.h5", "--learn-of-toss", "friction"]
+    words += ["--horizons", "--evaluations", "1", "--toss-samples", "40", "--substeps", "2"]
+    main(words)
+    assert "Learning mine.py from 8 recorded tosses into runs/mine-tosses" in capsys.readouterr().out
+    run = tmp_path / "runs" / "mine-tosses"
+    assert (run / "system.py").read_text() == OWN
+    measured = json.loads((run / "report.json").read_text())["evaluation"]
+    assert measured["tosses"] == 5
+    main([*words, "--out", str(run), "--resume"])
+    assert json.loads((run / "report.json").read_text())["evaluation"] == measured
+    kept = {}
+
+    def keep(*_, **options):
+        kept.update(options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("carom.cli.simulate.simulate", keep)
+    with pytest.raises(SystemExit):
+        main(["simulate", "mine.py", "--run-folder", str(run), "--initial", "test.h5"])
+    assert (kept["impact"], kept["compensation_steps"], kept["dt"]) == ("event", 2.0, pytest.approx(DT))
+    (tmp_path / "mine.py").unlink()  # the run has its own
+    main(["evaluate", str(run)])
+    again = json.loads((run / "evaluation.json").read_text())
+    assert {name: again[name] for name in measured} == measured
+    # What is shown is what was measured: errors of the shown poses, by the definitions, are those of the table.
+    shown = View(run, trajectories=5)._run_folder()
+    rows = list(csv.DictReader((run / "toss_errors_A.csv").read_text().splitlines()))
+    for k, (true, predicted) in enumerate(shown.pairs):
+        assert true is not None
+        np.testing.assert_allclose(true.x[0], predicted.x[0], atol=1e-12)
+        np.testing.assert_allclose(true.v[0], predicted.v[0], atol=1e-12)
+        middles = [np.asarray(box_points(shown.system, part.x))[:, 0] for part in (true, predicted)]
+        np.testing.assert_allclose(middles[0], tosses.x[8 + k, :, 0], atol=1e-12)
+        error = 100 * np.linalg.norm(middles[0] - middles[1], axis=1).mean() / 0.1
+        assert error == pytest.approx(float(rows[k]["position_percent"]), abs=1e-4)
+        assert predicted.contact.any()

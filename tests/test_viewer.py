@@ -151,7 +151,9 @@ def test_a_file_is_saved_as_a_page_and_as_a_gif(recorded, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["none.h5"], "none.h5"),
+        (["none.h5"], "there is no run folder or trajectory file 'none.h5'"),
+        (["nothing"], "there is no run folder or trajectory file 'nothing': check its name"),
+        (["two.h5", "--save", "nowhere/two.gif"], "nowhere (there is no such folder)"),
         (["two.h5", "--save", "two.png"], "save must end in .html, .gif, .mp4"),
         (["two.h5", "--trajectories", "0"], "trajectories must be at least 1"),
         (["two.h5", "--port", "70000"], "port must be from 0 to 65535"),
@@ -166,6 +168,16 @@ def test_wrong_requests_are_answered_in_a_line(recorded, capsys, arguments, said
     assert stop.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert said in line
+
+
+def test_what_a_movie_needs_is_said_first(recorded, capsys, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "imageio_ffmpeg" else find(name))
+    monkeypatch.setattr("carom.cli.view.data_and_system", None)  # nothing is read before
+    with pytest.raises(SystemExit) as stop:
+        main(["view", str(recorded), "--save", "two.mp4"])
+    assert stop.value.code == 2
+    assert "--save asks for an MP4, which needs the package imageio-ffmpeg" in capsys.readouterr().err
 
 
 @pytest.mark.slow

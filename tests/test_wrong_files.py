@@ -243,7 +243,9 @@ def test_a_file_named_as_the_other_format(tmp_path, is_now, was):
 def test_wrong_suffix(tmp_path, name):
     wanted = "the file must have a name that ends in .h5, .hdf5, .npz"
     (tmp_path / name).write_bytes(b"")
-    assert error_of(tmp_path / name).startswith(wanted)
+    line = error_of(tmp_path / name)
+    assert line.startswith(wanted)
+    assert f"it was '{name}'" in line
     with pytest.raises(CaromError, match=wanted):
         save_recording(tmp_path / name, a_recording())
 

@@ -7,12 +7,11 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from carom.cli.systems import choose
+from carom.cli.systems import data_and_system
 from carom.cli.tables import findings_table, told_table
 from carom.errors import CaromError
 from carom.learning.identify import MOST_POINTS, identify
 from carom.learning.inspection import inspect_recording
-from carom.simulation.files import load_recording
 from carom.simulation.recording import Recording
 from carom.simulation.recording_checks import check_recording
 from carom.system import System
@@ -29,17 +28,14 @@ class Check:
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """Trajectory file (.h5, .hdf5, .npz or .csv)."""
     task: str = ""
-    """Name of the task, or a Python file that sets `system`; by default the task that the file names."""
+    """Name of the task, or a Python file that sets `system`; by default the task that the file names, if any."""
     no_tell: bool = False
     """Leave out what the data can tell, which takes most of the time."""
 
     def run(self) -> None:
         """Do it."""
         console = Console()
-        chosen = choose(self.task) if self.task else None
-        recording = load_recording(self.data, task=chosen and chosen.task)
-        if chosen is None and recording.task:
-            chosen = choose(recording.task)
+        recording, chosen, word = data_and_system(self.data, self.task)
         findings = (
             check_recording(recording) if chosen is None else inspect_recording(recording, chosen.system).findings
         )
@@ -49,8 +45,10 @@ class Check:
             f"{recording.dt:.4g} s, {recording.n_points} points in {recording.dim}D"
         )
         console.print(findings_table(title, findings))
+        if word:
+            console.print(word, soft_wrap=True, highlight=False)
         if chosen is None:
-            console.print("With --task NAME or --task FILE.py: what they show of that system.", highlight=False)
+            console.print("That shows what they say of the system, too.", highlight=False)
         elif not self.no_tell:
             self._tell(recording, chosen.system, console)
         advised = sum(bool(finding.advice) for finding in findings)

@@ -7,15 +7,15 @@ from rich.console import Console
 
 from carom.checks import require
 from carom.cli.arguments import FilePath, FolderPath, RunPath
-from carom.cli.outcome import TEST_DATA, pictures, what_is_told
-from carom.cli.systems import chosen_by
+from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
+from carom.cli.systems import Chosen, chosen_by
 from carom.cli.tables import evaluation_table, property_table, told_table
-from carom.cli.tosses import measure, nominal_width, other_run
+from carom.cli.tosses import LearnedToss, measure
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
 from carom.simulation.files import load_recording
-from carom.system import System
+from carom.simulation.recording import check_system
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Evaluate:
         chosen = chosen_by(run)
         truth = chosen.system
         if config.get("tosses") is not None:
-            self._evaluate_tosses(run, truth)
+            self._evaluate_tosses(run, chosen)
             return
-        require(self.against is None, "against compares runs that learned from recorded tosses; this one did not.")
+        require(self.against is None, "--against compares runs that learned from recorded tosses; this one did not.")
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, truth)
         test = load_recording(self.data or run.path / TEST_DATA, task=chosen.task)
@@ -71,16 +71,18 @@ class Evaluate:
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         with theme("dark" if self.dark else "light"):
             pictures(run, system, test, predicted, found)
+        warn_if_far_off(console, measures)
         console.print(property_table(system, truth, config["task"] if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))
         console.print(evaluation_table(measures))
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)
 
-    def _evaluate_tosses(self, run: RunFolder, skeleton: System) -> None:
-        console, system = Console(), load_model_into(run.path / MODEL, skeleton)
-        test = load_recording(self.data or run.path / TEST_DATA, task=skeleton.name)
-        other = None if self.against is None else other_run(self.against, skeleton)
-        measures = measure(console, run, system, test, self.protocol, nominal_width(skeleton), other)
+    def _evaluate_tosses(self, run: RunFolder, chosen: Chosen) -> None:
+        console, learned = Console(), LearnedToss.of_run(run.path)
+        other = None if self.against is None else LearnedToss.of_run(self.against)
+        test = load_recording(self.data or run.path / TEST_DATA, task=chosen.task)
+        check_system(test, chosen.system, str(self.data or TEST_DATA))
+        measures = measure(console, run, learned, test, self.protocol, chosen, other)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures})
         console.print(f"Written to {run.path / 'evaluation.json'}", soft_wrap=True, highlight=False)

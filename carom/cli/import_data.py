@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import equinox as eqx
 import tyro
@@ -11,6 +11,11 @@ from rich.console import Console
 from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.arguments import FilePath
+
+if TYPE_CHECKING:
+    from carom.simulation.pose_conventions import Reading
+    from carom.simulation.poses import PoseRecording
+    from carom.simulation.recording_checks import Finding
 
 Kind = Annotated[Literal["poses", "contactnets"], tyro.conf.Positional, tyro.conf.arg(metavar="poses|contactnets")]
 Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
@@ -39,6 +44,10 @@ class Import:
     """Checksum that the archive must have."""
     scale: float = 1.0
     """Multiplies all recorded lengths."""
+    quaternion_order: Literal["wxyz", "xyzw"] | None = None
+    """Order in which the file has the numbers of a quaternion; wxyz unless it is given, if the motion fits that."""
+    quaternion_direction: Literal["body-to-world", "world-to-body"] | None = None
+    """Whose axes quaternions turn into whose; body-to-world unless it is given, if the motion fits that."""
     estimate_velocities: bool = False
     """Estimate velocities from poses even if the file has some."""
     keep_copies: bool = False
@@ -61,7 +70,7 @@ class Import:
         from carom.simulation import contactnets
 
         out, console = self.out or Path("cube_tosses.npz"), Console()
-        require(out.suffix == ".npz", f"out must end in .npz; it was {out}.")
+        require(out.suffix == ".npz", f"--out must end in .npz; it was {out}.")
         check_writable(out)
         if not self.file.exists():
             console.print(f"Fetching {contactnets.URL} ...", highlight=False, soft_wrap=True)
@@ -78,22 +87,26 @@ class Import:
         from carom.cli.tables import findings_table
         from carom.simulation.files import save_recording
         from carom.simulation.pose_checks import LATE, check_poses, flight_noise
+        from carom.simulation.pose_conventions import Reading
         from carom.simulation.poses import at_samples, load_poses, velocity_lag, with_velocities
 
         width = self.size
         require(
-            width is not None and width > 0, f"size must be the body's width, a positive length in m; it was {width}."
+            width is not None and width > 0,
+            f"--size must be the body's width, a positive length in m; it was {width}. Give --size 0.1 for 10 cm.",
         )
         assert width is not None
-        require(self.scale > 0, f"scale must be positive; it was {self.scale}.")
-        require(self.mass is None or self.mass > 0, f"mass must be positive, in kg; it was {self.mass}.")
+        require(self.scale > 0, f"--scale must be positive; it was {self.scale}.")
+        require(self.mass is None or self.mass > 0, f"--mass must be positive, in kg; it was {self.mass}.")
         out = self.out or self.file.with_name(f"{self.file.stem}-trajectories.h5")
         check_writable(out)
         poses, copies = load_poses(self.file, keep_copies=self.keep_copies)
         poses = eqx.tree_at(lambda p: p.position, poses, poses.position * self.scale)
         if poses.velocity is not None:
             poses = eqx.tree_at(lambda p: p.velocity, poses, poses.velocity * self.scale)
-        findings = check_poses(poses, width)
+        reading = Reading(self.quaternion_order or "wxyz", self.quaternion_direction or "body-to-world")
+        poses = eqx.tree_at(lambda p: p.quaternion, poses, reading.read(poses.quaternion))
+        findings = [self._check_reading(poses, width, reading), *check_poses(poses, width)]
         if self.estimate_velocities or poses.velocity is None or poses.omega is None:
             poses = with_velocities(poses)
         elif abs(lag := velocity_lag(poses) / poses.dt) > LATE:
@@ -108,3 +121,18 @@ class Import:
         if copies:
             console.print(f"{copies} trajectories that are copies of others were left out.", highlight=False)
         console.print(f"Written to {out}", soft_wrap=True, highlight=False)
+
+    def _check_reading(self, poses: "PoseRecording", width: float, reading: "Reading") -> "Finding":
+        """What the motion tells of how quaternions are written; `CaromError` if in another way than is assumed."""
+        from carom.simulation.pose_conventions import check_convention, options
+
+        found = check_convention(poses, width, reading)
+        given = (self.quaternion_order, self.quaternion_direction)
+        likely = [r for r in found.possible if all(part in (None, own) for part, own in zip(given, r, strict=True))]
+        ways = ", or ".join(f"{options(reading, r)}{' (likelier)' if r != likely[-1] else ''}" for r in likely)
+        require(
+            not found.wrong or not likely,
+            f"{self.file}: quaternion does not seem to be {reading}: {found.wrong}. Give {ways}. (With both options "
+            "they are taken as given.)",
+        )
+        return found.finding

@@ -16,14 +16,14 @@ import carom
 from carom.atomic import write_whole
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
-from carom.cli.outcome import TEST_DATA, pictures, what_is_told
+from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
 from carom.cli.systems import Chosen, choose, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import learn_and_measure
 from carom.contact.impulses import contact_model_of
 from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS, LearnConfig
-from carom.learning.dataset import Dataset
+from carom.learning.dataset import Dataset, hold_out, in_pieces, sessions_of
 from carom.learning.devices import is_first, start_processes
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
@@ -56,9 +56,9 @@ class Learn:
     data: FilePath = None
     """Trajectory file (.h5, .hdf5, .npz or .csv) to learn from; without it, data are simulated."""
     val: FilePath = None
-    """Trajectory file to validate on; without it, a tenth of the data."""
+    """Trajectory file to validate on; without it, a tenth of the data (of its sessions, if it has `group`)."""
     test: FilePath = None
-    """Trajectory file to test on; without it, a tenth of the data."""
+    """Trajectory file to test on; without it, a tenth of the data (of its sessions, if it has `group`)."""
     out: FolderPath = None
     """Run folder; by default runs/TASK-MODEL, with a number if that is taken."""
     resume: bool = False
@@ -89,7 +89,7 @@ class Learn:
         for k, word in enumerate(words):
             if word == "--from" or word.startswith("--from="):
                 folder = word.removeprefix("--from").removeprefix("=") or "".join(words[k + 1 : k + 2])
-                require(bool(folder), "from must be a run folder; nothing came after it.")
+                require(bool(folder), "--from must be a run folder; nothing came after it.")
                 return cls._of_run(RunFolder.open(folder))
         return None
 
@@ -134,18 +134,18 @@ class Learn:
         self.config.prepare(truth)
         require(
             self.data is not None or not chosen.own,
-            f"data is needed for {chosen.name}: a trajectory file to learn from.",
+            f"data is needed for {chosen.name}: give a trajectory file to learn from, --data FILE.",
         )
         contact_model_of(self.data_contact_model, argument="data_contact_model")
         require(
             0 <= self.data_noise < np.inf,
-            f"data_noise must be a finite number of at least 0; it was {self.data_noise}.",
+            f"--data-noise must be a finite number of at least 0; it was {self.data_noise}.",
         )
         require(
             self.data is None or not self.data_noise,
-            f"data_noise is for simulated data; it was {self.data_noise}, and data {str(self.data)!r}.",
+            f"--data-noise is for simulated data; it was {self.data_noise}, and --data {str(self.data)!r}.",
         )
-        require(self.trajectories >= 8, f"trajectories must be at least 8; it was {self.trajectories}.")
+        require(self.trajectories >= 8, f"--trajectories must be at least 8; it was {self.trajectories}.")
         if self.data is not None and can_learn_tosses(truth):
             self._run_tosses(console, chosen)
             return
@@ -181,29 +181,41 @@ class Learn:
     def _run_tosses(self, console: Console, chosen: Chosen) -> None:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
         self.tosses.check()
-        require(self.process_count == 1, f"process_count must be 1 for recorded tosses; it was {self.process_count}.")
-        folder = RunFolder.choose(self.out, f"{self.task}-tosses", resume=self.resume)
+        require(self.process_count == 1, f"--process-count must be 1 for recorded tosses; it was {self.process_count}.")
+        folder = RunFolder.choose(self.out, f"{chosen.stem}-tosses", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
-        data = load_recording(self.data or "", task=self.task)
-        if self.val is None:
-            parts = Dataset.split(data, seed=self.config.seed)
-            data, val = parts.train, parts.val
-        else:
-            val = load_recording(self.val, task=self.task)
+        train, test = self._toss_data(console, chosen)
         settings = {**self._description(chosen), "tosses": dataclasses.asdict(self.tosses)}
         if self.resume:
             run = RunFolder.open(folder)
             run.check_same(settings)
         else:
             run = RunFolder.create(folder, settings)
-        save_recording(run.path / TEST_DATA, val)
+        # Resumed too: a kill may have come before them.
+        if chosen.source is not None:
+            write_whole(run.path / SYSTEM, chosen.source)
+        save_recording(run.path / TEST_DATA, test)
         console.print(
-            f"Learning {self.task} from {data.n_trajectories} recorded tosses into {run.path}",
+            f"Learning {chosen.name} from {train.n_trajectories} recorded tosses into {run.path}",
             soft_wrap=True,
             highlight=False,
         )
-        learn_and_measure(console, run, chosen.system, data, val, self.tosses)
+        learn_and_measure(console, run, chosen, train, test, self.tosses)
+
+    def _toss_data(self, console: Console, chosen: Chosen) -> tuple[Recording, Recording]:
+        """Tosses to learn from and to measure on: the fit needs none to validate on, so that either file will do."""
+        assert self.data is not None
+        data = load_recording(self.data, task=chosen.task)
+        held = self.test or self.val
+        if self.test is not None and self.val is not None:
+            console.print(f"Recorded tosses are learned without validation: {self.val} is not used.", highlight=False)
+        if held is None:
+            count = data.n_trajectories
+            require(count >= 2, f"--data must hold at least 2 tosses, or --val others; it held {count}.")
+            parts = Dataset.split(data, seed=self.config.seed)
+            return parts.train, parts.val
+        return data, load_recording(held, task=chosen.task)
 
     def _chosen(self) -> Chosen:
         """The system to learn, under the name that it was first given."""
@@ -234,7 +246,7 @@ class Learn:
         truth = chosen.system
         if self.data is None:
             for name in ("val", "test"):
-                require(getattr(self, name) is None, f"{name} needs --data: give the file to train on too.")
+                require(getattr(self, name) is None, f"--{name} needs --data: give the file to train on too.")
             console.print(f"Simulating {self.task} ...", highlight=False)
             held = max(self.trajectories // 8, 2)
             counts = (self.trajectories, held, held)
@@ -250,6 +262,10 @@ class Learn:
             return Dataset(train, val), test
         data = load_recording(self.data, task=chosen.task)
         test = load_recording(self.test, task=chosen.task) if self.test else None
+        least = 1 + (self.test is None) + (self.val is None)
+        data, word = in_pieces(data, least, self.config.states)
+        if word:
+            console.print(word, soft_wrap=True, highlight=False)
         if test is None:
             data, test = _hold_out(data, self.config.seed)
         if self.val is not None:
@@ -271,6 +287,7 @@ class Learn:
                 "identification": found and dataclasses.asdict(found),
             },
         )
+        warn_if_far_off(console, measures)
         console.print(property_table(system, chosen.system, chosen.name if chosen.own else ""))
         if found is not None:
             console.print(told_table(system, found))
@@ -309,12 +326,12 @@ def _tuples(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _hold_out(data: Recording, seed: int) -> tuple[Recording, Recording]:
-    """Keep a tenth of the trajectories for the test."""
-    n = data.n_trajectories
-    require(n >= 3, f"data must hold at least 3 trajectories, to train, validate and test; it held {n}.")
-    order = np.random.default_rng((seed, 2)).permutation(n)
-    count = max(1, round(n / 10))
-    return data.select(np.sort(order[count:])), data.select(np.sort(order[:count]))
+    """Keep a tenth of the trajectories for the test, or of the sessions where there are some."""
+    n = len(np.unique(sessions_of(data)))
+    what, more = ("trajectories", "") if data.group is None else ("sessions (group)", " Or give --val and --test.")
+    require(n >= 3, f"data must hold at least 3 {what}, to train, validate and test; it held {n}.{more}")
+    held = hold_out(data, 0.1, np.random.default_rng((seed, 2)))
+    return data.select(~held), data.select(held)
 
 
 def _digest(path: Path) -> str | None:

@@ -13,9 +13,6 @@ import traceback
 from pathlib import Path
 from typing import Annotated, Any
 
-# XLA's loader of cached programs logs pages about processor features; set this to 0 to see all it says.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-
 import tyro
 
 from carom.errors import CaromError
@@ -37,7 +34,7 @@ COMMANDS = {
 DESCRIPTION = "Learn mechanical systems with contact from trajectories, simulate and control them."
 EPILOG = (
     "`carom COMMAND --help` has the options of a command, --help-all the rare ones too. --debug, anywhere, shows where "
-    "an error is from."
+    "an error is from, and what XLA logs."
 )
 
 
@@ -46,6 +43,8 @@ def main(arguments: list[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
+    if not debug:
+        quiet_xla()
     command: Any = None
     try:
         command = _parsed(words)
@@ -133,6 +132,18 @@ def _hide_rare_options(command: type) -> None:
             hidden = True
     if hidden:
         command.__doc__ = f"{inspect.cleandoc(command.__doc__ or '')}\n\nRare options: --help-all."
+
+
+def quiet_xla() -> None:
+    """Let XLA's log lines end at what ends the program; JAX must not have been loaded before.
+
+    XLA's loader of cached programs logs, as an error, kilobytes about features of the processor that "could lead to
+    execution errors such as SIGILL" wherever a program's list has XLA's own tuning options, which no processor has. The
+    cache keeps processors apart, so it means nothing. Hence level 3: only fatal errors are logged. All others come as
+    Python exceptions with their text. A level that is there is replaced: JAX leaves its own, 1, to the commands that a
+    program or notebook starts.
+    """
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
 
 def configure_jax() -> None:

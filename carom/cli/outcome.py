@@ -7,10 +7,11 @@ import numpy as np
 from rich.console import Console
 
 from carom.cli.tables import property_names
+from carom.errors import CaromError
 from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import trajectory_of
-from carom.learning.evaluate import state_errors
+from carom.learning.evaluate import far_off, state_errors
 from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.run import TRUTH, RunFolder
 from carom.learning.train import quantities
@@ -27,7 +28,7 @@ def what_is_told(
 ) -> Identification | None:
     """What the recording tells of the properties of a system learned with `config`.
 
-    None for a baseline, which has no properties, and for a system that is too large.
+    None for a baseline, which has no properties, for a system that is too large, and where it cannot be found.
     """
     if config["model"] in BASELINES:
         return None
@@ -35,13 +36,42 @@ def what_is_told(
         console.print(f"What the data can tell is found for systems of up to {MOST_POINTS} points.", highlight=False)
         return None
     console.print("Finding what the data can tell ...", highlight=False)
-    return identify(
-        system,
-        recording,
-        learned=config["learn"],
-        formulation=FORMULATIONS[config["model"]],
-        compensation_steps=config["compensation_steps"],
-        project=config["project"],
+    try:
+        return identify(
+            system,
+            recording,
+            learned=config["learn"],
+            formulation=FORMULATIONS[config["model"]],
+            compensation_steps=config["compensation_steps"],
+            project=config["project"],
+        )
+    except CaromError as error:  # what was learned is to be kept and measured all the same
+        console.print(f"It cannot be found: {error}", highlight=False)
+        return None
+
+
+def warn_if_far_off(console: Console, measures: dict[str, Any]) -> None:
+    """Say before all else where predictions do not explain the data (`far_off`)."""
+    if far_off(measures):
+        say_unexplained(
+            console,
+            f"predictions are off by {percent(measures['trajectory_error_median'])} in the median and "
+            f"{percent(measures['trajectory_error'])} in the mean, above {percent(measures['error_allowed'])}",
+        )
+
+
+def percent(share: float) -> str:
+    """A share in words that stay short, whatever became of it."""
+    return "not a number" if np.isnan(share) else f"{share:.0%}" if share < 10 else "more than 1000%"
+
+
+def say_unexplained(console: Console, why: str) -> None:
+    """The warning, in its colour."""
+    console.print(
+        f"The learned system does not explain the data: {why} (docs/identifiability.md).",
+        style="bold yellow",
+        soft_wrap=True,
+        highlight=False,
     )
 
 
@@ -75,4 +105,4 @@ def one_of(batch: Trajectory, k: int, length: int) -> Trajectory:
 
 def most_eventful(test: Recording) -> int:
     """The test trajectory with the most contact, the first of equals."""
-    return 0 if test.contact is None else int(np.argmax(test.contact.sum(axis=1)))
+    return 0 if test.contact is None else int(np.argmax((test.contact & test.valid).sum(axis=1)))

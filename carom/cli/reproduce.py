@@ -20,12 +20,17 @@ MINUTES = {"bp5-e": 1.5, "bp5": 1.5, "bd5": 4, "cp3-e": 0.7, "cp3": 0.7, "gyro-e
 class Reproduce:
     """Learn what a table of the paper's supplement needs, measure it, and write results/TABLE.json and TABLE.md.
 
-    Finished trainings, and those that the written table has already, are skipped; stopped ones go on. `all`: every
-    table; `page`: docs/results.md from what there is, and its pictures.
+    s1 to s10 are the tables S.1 to S.10 of the supplement; properties and figure3 are of contact properties and of the
+    paper's figure 3; all is every one of these. page trains nothing: it writes the page of results (--page) and its
+    pictures from the tables that are there (--results).
+
+    Finished trainings, and those that the written table has already, are skipped; stopped ones go on.
     """
 
     table: Annotated[
-        Choice, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(get_args(Choice)), help="Which table.")
+        Choice,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="|".join(get_args(Choice)), help="Which table; or page, the page of all tables."),
     ]
     seeds: int = 3
     """Trainings of each kind, with seeds 0, 1, ..."""
@@ -34,7 +39,7 @@ class Reproduce:
     results: Path = Path("results")
     """Folder of the tables."""
     page: Path = Path("docs/results.md")
-    """File that `page` writes."""
+    """File that `carom reproduce page` writes."""
     workers: int = 1
     """Trainings at the same time, each a process."""
     only: str = ""
@@ -54,8 +59,8 @@ class Reproduce:
         from carom.reproduction.tables import BUILDERS, table
 
         console = Console()
-        require(self.seeds >= 1, f"seeds must be at least 1; it was {self.seeds}.")
-        require(self.workers >= 1, f"workers must be at least 1; it was {self.workers}.")
+        require(self.seeds >= 1, f"--seeds must be at least 1; it was {self.seeds}.")
+        require(self.workers >= 1, f"--workers must be at least 1; it was {self.workers}.")
         if self.table == "page":
             from carom.atomic import check_writable, write_whole
 
@@ -70,7 +75,8 @@ class Reproduce:
         wanted = [name for name in names if not every[name] or any(self.only in job for job in every[name])]
         require(
             any(self.only in job for name in names for job in every[name]),
-            f"only must be in the name of a training of {self.table}, e.g. {every[names[0]][0]}; it was {self.only!r}.",
+            f"--only must be in the name of a training of {self.table}, e.g. {every[names[0]][0]}; it was "
+            f"{self.only!r}.",
         )
         for name in wanted:
             self._one(name, console)

@@ -55,17 +55,17 @@ def parse_space(words: Sequence[str]) -> Space:
 
     **Raises:** `CaromError` for words of another form, unknown options, and values that an option cannot have.
     """
-    require(len(words) > 0, "over must name what to vary, such as width=64,128,256 learning_rate=1e-4:1e-2:log.")
+    require(len(words) > 0, "--over must name what to vary, such as width=64,128,256 learning_rate=1e-4:1e-2:log.")
     space: dict[str, Range | Choices] = {}
     for word in words:
         name, sign, values = word.partition("=")
         name = name.strip().replace("-", "_")
         require(
             bool(sign and values),
-            f"over must be of the form NAME=A,B,C or NAME=LOW:HIGH or NAME=LOW:HIGH:log; it was {word!r}.",
+            f"--over must be of the form NAME=A,B,C or NAME=LOW:HIGH or NAME=LOW:HIGH:log; it was {word!r}.",
         )
-        require(name in OPTIONS, f"over can vary {', '.join(OPTIONS)}; it was {name!r}.")
-        require(name not in space, f"over names {name} twice.")
+        require(name in OPTIONS, f"--over can vary {', '.join(OPTIONS)}; it was {name!r}.")
+        require(name not in space, f"--over names {name} twice.")
         space[name] = _range(name, word, values) if ":" in values else _choices(name, values)
     return space
 
@@ -76,20 +76,20 @@ def grid(space: Space) -> list[dict[str, Any]]:
     **Raises:** `CaromError` if it has ranges.
     """
     ranges = [name for name, values in space.items() if isinstance(values, Range)]
-    require(not ranges, f"method grid needs lists of values (NAME=A,B,C); {', '.join(ranges)} had a range.")
+    require(not ranges, f"--method grid needs lists of values (NAME=A,B,C); {', '.join(ranges)} had a range.")
     choices = {name: values.values for name, values in space.items() if isinstance(values, Choices)}
     return [dict(zip(choices, combination, strict=True)) for combination in itertools.product(*choices.values())]
 
 
 def _choices(name: str, values: str) -> Choices:
     found = tuple(_value(name, value.strip()) for value in values.split(","))
-    require(len(set(found)) == len(found), f"over names a value of {name} twice: {values}.")
+    require(len(set(found)) == len(found), f"--over names a value of {name} twice: {values}.")
     return Choices(found)
 
 
 def _range(name: str, word: str, values: str) -> Range:
     low, high, *rest = [part.strip() for part in values.split(":")]
-    require(rest in ([], ["log"]), f"over has ranges NAME=LOW:HIGH or NAME=LOW:HIGH:log; it was {word!r}.")
+    require(rest in ([], ["log"]), f"--over has ranges NAME=LOW:HIGH or NAME=LOW:HIGH:log; it was {word!r}.")
     ends = [_value(name, end) for end in (low, high)]
     require(
         all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends),

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -41,8 +42,9 @@ class Simulate:
     """Seed of the initial states."""
     project: bool = True
     """Bring each step's end back onto the constraints."""
-    impact: ImpactRule = "step"
-    """Contacts act at the end of the step in which they close (step), or at the time at which they close (event)."""
+    impact: ImpactRule | Literal["auto"] = "auto"
+    """Contacts act at the end of the step in which they close (step), or at the time at which they close (event); auto:
+    as the learned model was learned, or step."""
     contact_model: ContactModelName | None = None
     """Contact model; by default that of the learned model, or cm."""
     compensation_steps: CompensationSteps = "auto"
@@ -56,22 +58,23 @@ class Simulate:
         """Do it."""
         chosen = choose(self.task)
         system, formulation, source = chosen.system, "lagrangian", "carom simulate"
-        compensation = COMPENSATION_STEPS
+        compensation, impact = COMPENSATION_STEPS, "step"
         if self.run_folder is not None:
             system, header = learned_system(self.run_folder, self.task)
             formulation, compensation = header["formulation"], header["compensation_steps"]
+            impact = header["impact"]
             source = f"carom simulate, model {self.run_folder / MODEL}"
         if self.contact_model is not None:
             system, source = (
                 system.with_contact_model(self.contact_model),
                 f"{source}, contact model {self.contact_model}",
             )
-        require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
+        require(self.trajectories >= 1, f"--trajectories must be at least 1; it was {self.trajectories}.")
         out = Path(f"{chosen.stem}.h5") if self.out is None else self.out
         check_writable(out)
         require(
             self.initial is not None or not chosen.own,
-            f"initial is needed for {self.task}: a trajectory file, to start from its first states.",
+            f"initial is needed for {self.task}: give a file to start from its first states, --initial FILE.",
         )
         first = None if self.initial is None else load_recording(self.initial, task=chosen.task)
         if first is not None:
@@ -89,7 +92,7 @@ class Simulate:
             v0,
             dt=dt if self.dt is None else self.dt,
             steps=steps if self.steps is None else self.steps,
-            impact=self.impact,
+            impact=impact if self.impact == "auto" else self.impact,
             project=self.project,
             formulation=formulation,
             compensation_steps=compensation if self.compensation_steps == "auto" else self.compensation_steps,

@@ -13,11 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from carom.atomic import write_whole
-from carom.checks import require
+from carom.checks import optional_package, require
 from carom.cli.arguments import FilePath, FolderPath, SystemName
 from carom.cli.learn import Learn
 from carom.cli.search_space import Space, grid, parse_space, words_of
@@ -76,13 +77,10 @@ class Sweep:
 
     def run(self) -> None:
         """Do it."""
-        try:
-            import optuna
-        except ImportError as error:
-            raise CaromError("carom sweep needs optuna: pip install 'carom[sweep]'.") from error
+        optuna = optional_package("optuna", "carom sweep", "sweep")
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         for name in ("trials", "workers"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
+            require(getattr(self, name) >= 1, f"--{name} must be at least 1; it was {getattr(self, name)}.")
         space, chosen, console = parse_space(self.over), choose(self.task), Console()
         combinations = grid(space) if self.method == "grid" else []
         folder = Path("sweeps") / chosen.stem if self.out is None else self.out
@@ -91,8 +89,7 @@ class Sweep:
             self._prepare(folder, chosen, console)
             study = _study(folder, self.method, self.config.seed)
             _requeue(study)
-            for combination in combinations:
-                study.enqueue_trial(combination, skip_if_exists=True)
+            _enqueue(study, combinations)
             trials = len(combinations) or self.trials
             try:
                 _Trials(self, study, space, folder, trials, console, lock).run()
@@ -171,12 +168,14 @@ def _study(folder: Path, method: str, seed: int) -> Any:
     """The study in the folder's database, a new one if there is none."""
     import optuna
 
-    sampler = optuna.samplers.TPESampler(seed=seed) if method == "tpe" else optuna.samplers.RandomSampler(seed=seed)
     path = folder / DATABASE
     try:
-        return optuna.create_study(
-            storage=f"sqlite:///{path}", study_name="carom", sampler=sampler, load_if_exists=True
-        )
+        study = optuna.create_study(storage=f"sqlite:///{path}", study_name="carom", load_if_exists=True)
+        # A sampler begins anew in each process: from the seed alone, it would draw what the first one has drawn.
+        drawn = len(study.get_trials(deepcopy=False))
+        kind = optuna.samplers.TPESampler if method == "tpe" else optuna.samplers.RandomSampler
+        study.sampler = kind(seed=int(np.random.SeedSequence((seed, drawn)).generate_state(1)[0]))
+        return study
     except Exception as error:  # sqlalchemy has many for a damaged file
         first = (str(error).splitlines() or [""])[0]
         raise CaromError(f"cannot use {path} ({first}). Restore it, or choose another folder with --out.") from error
@@ -188,6 +187,18 @@ def _requeue(study: Any) -> None:
 
     for trial in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
         _again(study, trial)
+
+
+def _enqueue(study: Any, combinations: list[dict[str, Any]]) -> None:
+    """Put the combinations into the queue that are neither there nor finished; one that failed, with its folder."""
+    import optuna
+
+    trials = study.get_trials()
+    for combination in combinations:
+        same = [t for t in trials if t.system_attrs.get("fixed_params", t.params) == combination]
+        if all(trial.state == optuna.trial.TrialState.FAIL for trial in same):
+            kept = {"folder": _name(same[-1])} if same else None
+            study.enqueue_trial(combination, user_attrs=kept)
 
 
 def _again(study: Any, trial: Any) -> None:

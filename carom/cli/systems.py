@@ -12,8 +12,10 @@ from carom.checks import require
 from carom.errors import CaromError
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, SYSTEM, RunFolder
+from carom.simulation.files import load_recording
+from carom.simulation.recording import Recording
 from carom.system import System
-from carom.tasks import task
+from carom.tasks import TASKS, task
 
 VARIABLE = "system"
 """What a Python file calls its system."""
@@ -75,6 +77,22 @@ def choose(name: str) -> Chosen:
         found = "missing" if system is None else type(system).__name__
         raise CaromError(f"{name} must set `{VARIABLE}` to a carom.System outside of any function; it was {found}.")
     return Chosen(name, system, path.read_bytes())
+
+
+def data_and_system(path: Path, name: str) -> tuple[Recording, Chosen | None, str]:
+    """A recording; the system of this name, or without one that of the recording's task; and a word where these differ.
+
+    **Raises:** `CaromError` if the file cannot be read, or there is no system of the name that was given.
+    """
+    chosen, recording = choose(name) if name else None, load_recording(path)
+    its = recording.task
+    if chosen is None:
+        if its in TASKS:
+            return recording, choose(its), ""
+        known = f"is of {its!r}, which is no task of carom's" if its else "does not say of which task it is"
+        return recording, None, f"{path} {known}. Give --task NAME, or --task FILE.py that sets `{VARIABLE}`."
+    differs = bool(its) and chosen.task not in (None, its)
+    return recording, chosen, f"{path} says that it is of {its!r}; it is taken as of {name!r}." if differs else ""
 
 
 def chosen_by(run: RunFolder) -> Chosen:

@@ -54,7 +54,7 @@ def property_table(system: System, truth: System, file: str = "") -> Table:
 def told_table(system: System, found: Identification) -> Table:
     """What the data tell of each quantity that was learned.
 
-    `impacts` are all of the data, `telling` those looked at on which the quantity has an effect.
+    `impacts` are all of the data, `telling` those of them that were looked at on which the quantity has an effect.
     """
     table = Table(title="What the data tell")
     for name in ("quantity", "of"):

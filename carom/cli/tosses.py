@@ -8,47 +8,88 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
 from carom.atomic import write_whole
+from carom.checks import require
+from carom.cli.outcome import percent, say_unexplained
+from carom.cli.systems import Chosen, chosen_by
 from carom.learning.dataset import trajectory_of
+from carom.learning.evaluate import FAR_OFF
 from carom.learning.model_file import load_model_into, save_model
 from carom.learning.protocols import (
     Protocol,
     TossErrors,
     body_points,
     box_of,
+    moments_of,
     paired_difference,
+    pose_errors,
     protocol_starts,
     toss_errors,
 )
-from carom.learning.run import MODEL, REPORT, RunFolder
+from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
 from carom.learning.toss_parameters import CENTER
-from carom.learning.tosses import TossConfig, TossReport, learn_tosses, predict_tosses
+from carom.learning.tosses import COMPENSATION, IMPACT, TossConfig, TossReport, learn_tosses, predict_tosses
 from carom.simulation.recording import Recording
 from carom.system import System
 
 PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": 8.1e-4, **dict.fromkeys(CENTER, 0.0)}
 """Of the acrylic cube (Pfrommer, Halm, Posa, CoRL 2020), with its mass in the middle."""
 
+NOMINAL = 0.1048
+"""Width of that cube (m)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedToss:
+    """A tossed body as a run has learned it, with the `substeps` that it was learned, and is predicted, with."""
+
+    name: str
+    system: System
+    substeps: int
+
+    @classmethod
+    def of_run(cls, folder: Path) -> "LearnedToss":
+        """That of a run folder.
+
+        **Raises:** `CaromError` if the folder is none of a run that has learned from recorded tosses.
+        """
+        run = RunFolder.open(folder)
+        tosses = run.read_json(CONFIG).get("tosses")
+        require(tosses is not None, f"{folder} must be a run that learned from recorded tosses; it is another.")
+        return cls(folder.name, load_model_into(run.path / MODEL, chosen_by(run).system), tosses["substeps"])
+
+    def predict(self, recording: Recording):
+        """Points of all tosses from their first recorded states."""
+        return predict_tosses(self.system, recording, substeps=self.substeps)
+
 
 def learn_and_measure(
-    console: Console, run: RunFolder, skeleton: System, train: Recording, val: Recording, config: TossConfig
+    console: Console, run: RunFolder, chosen: Chosen, train: Recording, test: Recording, config: TossConfig
 ) -> None:
-    """Learn from `train`, measure on `val` by protocol A, and write all that into the run folder."""
-    system, report = learn_tosses(skeleton, train, config, run=run)
-    save_model(run.path / MODEL, system)
-    console.print(estimate_table(report, skeleton.name))
+    """Learn from `train`, measure on `test` by protocol A, and write all that into the run folder."""
+    system, report = learn_tosses(chosen.system, train, config, run=run)
+    save_model(run.path / MODEL, system, compensation_steps=COMPENSATION, impact=IMPACT)
+    console.print(estimate_table(report, chosen.name))
     console.print("Mass is not learned: forces are in proportion to it, so that it drops out of the motion.")
-    measures = measure(console, run, system, val, "A", nominal_width(skeleton))
+    learned = LearnedToss(run.path.name, system, config.substeps)
+    measures = measure(console, run, learned, test, "A", chosen)
     run.write_json(REPORT, {"learned": dataclasses.asdict(report), "evaluation": measures})
     console.print(f"Done ({report.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
 
 
-def nominal_width(skeleton: System) -> float:
+def nominal_width(chosen: Chosen) -> float:
     """The width that errors are given in: the cube's nominal one, whatever its recordings say."""
-    return 0.1048 if skeleton.name == "cube" else 2 * float(np.min(box_of(skeleton).half_widths))
+    return NOMINAL if chosen.name == "cube" else 2 * float(np.min(box_of(chosen.system).half_widths))
+
+
+def touching_height(chosen: Chosen) -> float:
+    """Height of the box's middle (m) at which a corner can touch: half of its diagonal."""
+    half = np.full(3, NOMINAL / 2) if chosen.name == "cube" else np.asarray(box_of(chosen.system).half_widths)
+    return float(np.linalg.norm(half))
 
 
 def estimate_table(report: TossReport, name: str) -> Table:
@@ -70,16 +111,18 @@ def estimate_table(report: TossReport, name: str) -> Table:
 def measure(
     console: Console,
     run: RunFolder,
-    system: System,
+    learned: LearnedToss,
     recording: Recording,
     protocol: Protocol,
-    width: float,
-    baseline: tuple[str, System] | None = None,
+    chosen: Chosen,
+    baseline: LearnedToss | None = None,
 ) -> dict[str, Any]:
     """Predict every toss and print, write and draw how far off that is; against a `baseline` too, toss by toss."""
-    data = protocol_starts(recording, protocol, width)
-    predicted = predict_tosses(system, data)
+    system, width = learned.system, nominal_width(chosen)
+    data = protocol_starts(recording, protocol, touching_height(chosen), moments_of(system))
+    predicted = learned.predict(data)
     errors = toss_errors(system, data, predicted, width)
+    _warn_if_far_off(console, data, errors.position * width / 100)
     out: dict[str, Any] = {"protocol": protocol, "tosses": len(errors.position), **errors.summary()}
     shown = {"learned": errors}
     table = Table(title=f"Protocol {protocol}: {len(errors.position)} tosses")
@@ -91,8 +134,8 @@ def measure(
         table.add_row(f"{name} ({unit})", *(f"{row[part]:.2f}" for part in ("mean", "sd", "median")))
     console.print(table)
     if baseline is not None:
-        name, other = baseline
-        shown[name] = toss_errors(other, data, predict_tosses(other, data), width)
+        name = baseline.name
+        shown[name] = toss_errors(baseline.system, data, baseline.predict(data), width)
         out["difference"] = {}
         for kind in ("position", "rotation"):
             found = paired_difference(getattr(errors, kind), getattr(shown[name], kind), data.group)
@@ -106,6 +149,15 @@ def measure(
     write_errors(run.path / f"toss_errors_{protocol}.csv", data, errors)
     _pictures(run, system, data, predicted, errors, shown)
     return out
+
+
+def _warn_if_far_off(console: Console, data: Recording, distance: Float[np.ndarray, " N"]) -> None:
+    """Say where predictions whose centres are off by `distance` (m) do not explain the tosses."""
+    way, _ = pose_errors(np.broadcast_to(data.x[:, :1], data.x.shape), data.x, data.length)
+    share = float(np.median(distance / np.maximum(way, 1e-300)))
+    if not share <= FAR_OFF:
+        why = f"predictions are off by {percent(share)} of the way from the start in the median, above {FAR_OFF:.0%}"
+        say_unexplained(console, why)
 
 
 def write_errors(path: Path, recording: Recording, errors: TossErrors) -> None:
@@ -131,8 +183,3 @@ def _pictures(run: RunFolder, system, data: Recording, predicted, errors: TossEr
     shown_as = (body_points(system, points) for points in (true.x, jnp.asarray(predicted[k, :count])))
     true, guess = (dataclasses.replace(true, x=points) for points in shown_as)
     animate.animate(system, true, guess, run.path / "prediction.gif")
-
-
-def other_run(folder: Path, skeleton: System) -> tuple[str, System]:
-    """The system of another run, to compare with, by the folder's name."""
-    return folder.name, load_model_into(RunFolder.open(folder).path / MODEL, skeleton)

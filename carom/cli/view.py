@@ -13,18 +13,24 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from carom.atomic import check_writable
 from carom.checks import require
 from carom.cli.outcome import TEST_DATA, one_of
-from carom.cli.systems import choose, chosen_by
+from carom.cli.systems import Chosen, chosen_by, data_and_system
+from carom.cli.tosses import LearnedToss
+from carom.errors import CaromError
 from carom.learning.dataset import trajectory_of
 from carom.learning.evaluate import predict
 from carom.learning.model_file import load_model_into, read_model_header
+from carom.learning.protocols import body_points
 from carom.learning.run import CONFIG, MODEL, RunFolder
+from carom.learning.tosses import COMPENSATION, toss_motions
 from carom.simulation.files import load_recording
 from carom.simulation.impact import COMPENSATION_STEPS
 from carom.simulation.recording import Recording, check_system
 from carom.simulation.rollout import Trajectory
 from carom.system import System
+from carom.view.extras import check_movies
 
 HOST = "127.0.0.1"
 """Nobody else's computer can look."""
@@ -58,14 +64,20 @@ class View:
 
     def run(self) -> None:
         """Do it."""
-        require(self.trajectories >= 1, f"trajectories must be at least 1; it was {self.trajectories}.")
-        require(0 <= self.port < 65536, f"port must be from 0 to 65535; it was {self.port}.")
+        require(self.trajectories >= 1, f"--trajectories must be at least 1; it was {self.trajectories}.")
+        require(0 <= self.port < 65536, f"--port must be from 0 to 65535; it was {self.port}.")
         if self.save is not None:
-            require(
-                self.save.suffix.lower() in KINDS, f"save must end in {', '.join(KINDS)}; it was {str(self.save)!r}."
-            )
+            suffix = self.save.suffix.lower()
+            require(suffix in KINDS, f"--save must end in {', '.join(KINDS)}; it was {str(self.save)!r}.")
+            check_writable(self.save)
+            if suffix == ".mp4":
+                check_movies("--save")
+        require(
+            self.run_or_file.exists(),
+            f"there is no run folder or trajectory file {str(self.run_or_file)!r}: check its name.",
+        )
         console = Console()
-        shown = self._run_folder() if self.run_or_file.is_dir() else self._file()
+        shown = self._run_folder() if self.run_or_file.is_dir() else self._file(console)
         if self.save is None:
             with tempfile.TemporaryDirectory() as folder:
                 self._serve(shown.page(Path(folder) / "page.html").read_bytes(), console)
@@ -81,7 +93,9 @@ class View:
 
     def _run_folder(self) -> "_Shown":
         run = RunFolder.open(self.run_or_file)
-        chosen, name = chosen_by(run), run.read_json(CONFIG)["task"]
+        chosen, config = chosen_by(run), run.read_json(CONFIG)
+        if config.get("tosses") is not None:
+            return self._tosses(run, chosen, config["task"])
         header = read_model_header(run.path / MODEL)
         system = load_model_into(run.path / MODEL, chosen.system)
         test = self._some(load_recording(run.path / TEST_DATA, task=chosen.task))
@@ -91,17 +105,27 @@ class View:
             (true, one_of(found, k, len(true.time)))
             for k, true in enumerate(trajectory_of(test, k) for k in range(test.n_trajectories))
         ]
-        return _Shown(system, pairs, f"{name}: true and predicted", compensation)
+        return _Shown(system, pairs, f"{config['task']}: true and predicted", compensation)
 
-    def _file(self) -> "_Shown":
-        chosen = choose(self.task) if self.task else None
-        recording = load_recording(self.run_or_file, task=chosen and chosen.task)
-        name = self.task or recording.task
-        require(
-            bool(name),
-            f"{self.run_or_file} does not say of which task it is. Give its name, or a Python file, with --task.",
-        )
-        system = (chosen or choose(name)).system
+    def _tosses(self, run: RunFolder, chosen: Chosen, name: str) -> "_Shown":
+        """Predictions as they were measured, of the body's own points: recordings are of the middle of its box."""
+        learned = LearnedToss.of_run(run.path)
+        test = self._some(load_recording(run.path / TEST_DATA, task=chosen.task))
+        found = toss_motions(learned.system, test, substeps=learned.substeps)
+        pairs = []
+        for k, recorded in enumerate(trajectory_of(test, k) for k in range(test.n_trajectories)):
+            x, v = (body_points(learned.system, part) for part in (recorded.x, recorded.v))
+            true = dataclasses.replace(recorded, x=x, v=v)
+            pairs.append((true, one_of(found, k, len(true.time))))
+        return _Shown(learned.system.with_max_active(4), pairs, f"{name}: true and predicted", COMPENSATION)
+
+    def _file(self, console: Console) -> "_Shown":
+        recording, chosen, word = data_and_system(self.run_or_file, self.task)
+        if chosen is None:
+            raise CaromError(word)
+        if word:
+            console.print(word, soft_wrap=True, highlight=False)
+        system, name = chosen.system, chosen.name
         check_system(recording, system, str(self.run_or_file))
         recording = self._some(recording)
         pairs = [(None, trajectory_of(recording, k)) for k in range(recording.n_trajectories)]
@@ -111,14 +135,14 @@ class View:
         """The trajectories to show, those with the most contact first."""
         if recording.contact is None:
             return recording.select(slice(self.trajectories))
-        order = np.argsort(-recording.contact.sum(axis=1), kind="stable")
+        order = np.argsort(-(recording.contact & recording.valid).sum(axis=1), kind="stable")
         return recording.select(order[: self.trajectories])
 
     def _serve(self, page: bytes, console: Console) -> None:
         try:
             server = http.server.ThreadingHTTPServer((HOST, self.port), _handler(page))
         except OSError as error:
-            require(False, f"port {self.port} cannot be used ({error.strerror}): give another, or 0 for any.")
+            require(False, f"--port {self.port} cannot be used ({error.strerror}): give another, or 0 for any.")
             raise
         with server:
             address = f"http://{HOST}:{server.server_address[1]}/"

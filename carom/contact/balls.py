@@ -10,7 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import (
+    as_floats,
+    at_once_if_known,
+    not_negative,
+    positive,
+    require,
+    require_values,
+    whole,
+    whole_numbers,
+)
 from carom.contact.candidates import Candidates, Contact, plane, property_indices
 from carom.contact.geometry import sphere_plane, sphere_sphere
 
@@ -63,10 +72,12 @@ class BallPlane(Contact):
     property_index: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, bodies: Iterable[int], centers, radii, point, normal, property: int | Sequence[int] = 0):
-        self.bodies = tuple(int(b) for b in bodies)
+        self.bodies = whole_numbers("BallPlane bodies", bodies)
         self.point, self.normal = plane("BallPlane", point, normal)
         count, dim = len(self.bodies), self.normal.shape[0]
         self.centers, radii = as_floats(centers), as_floats(radii)
+        if count == 0:
+            self.centers, radii = self.centers.reshape(0, dim), radii.reshape(-1)
         require(
             self.centers.shape == (count, dim),
             f"BallPlane centers must be {count} places of {dim} coordinates; their shape was {self.centers.shape}.",
@@ -74,8 +85,10 @@ class BallPlane(Contact):
         require(
             radii.shape in ((), (count,)), f"BallPlane radii must be one or {count}; their shape was {radii.shape}."
         )
-        self.radii = jnp.broadcast_to(radii, (count,))
-        require_values("radii", radii, self.radii >= 0, "zero or positive lengths in m")
+        with at_once_if_known(radii):
+            self.radii = jnp.broadcast_to(radii, (count,))
+        require_values("radii", radii, not_negative, "zero or positive lengths in m")
+        require_values("centers", centers, np.isfinite, "finite coordinates in m")
         self.property_index = property_indices("BallPlane", property, count)
 
     def candidates(self, x, radii, table):
@@ -131,7 +144,9 @@ class BallBall(Contact):
     property_index: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, pairs: Iterable[tuple[int, int | None]], centers, radii, property: int | Sequence[int] = 0):
-        self.pairs = tuple((int(a), None if b is None else int(b)) for a, b in pairs)
+        self.pairs = tuple(
+            (whole("BallBall pairs", a), None if b is None else whole("BallBall pairs", b)) for a, b in pairs
+        )
         for a, b in self.pairs:
             require(a != b, f"BallBall pairs two different bodies; a pair was ({a}, {b}).")
         self.centers, self.radii = as_floats(centers), as_floats(radii)
@@ -144,7 +159,8 @@ class BallBall(Contact):
             self.radii.shape == (count, 2),
             f"BallBall radii must be {count} pairs; their shape was {self.radii.shape}.",
         )
-        require_values("radii", radii, self.radii > 0, "positive lengths in m")
+        require_values("radii", radii, positive, "positive lengths in m")
+        require_values("centers", centers, np.isfinite, "finite coordinates in m")
         self.property_index = property_indices("BallBall", property, count)
 
     def candidates(self, x, radii, table):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, at_once_if_known, positive, require, require_values, whole_numbers
 from carom.contact.candidates import Candidates, Contact, plane, property_indices
 from carom.contact.geometry import sphere_plane
 
@@ -51,7 +51,7 @@ class CornerPlane(Contact):
         property: int | Sequence[int] = 0,
         center=None,
     ):
-        self.bodies = tuple(int(b) for b in bodies)
+        self.bodies = whole_numbers("CornerPlane bodies", bodies, once=True)
         self.point, self.normal = plane("CornerPlane", point, normal)
         dim = self.normal.shape[0]
         half_widths, self.corner_radius = as_floats(half_widths), as_floats(corner_radius)
@@ -59,20 +59,22 @@ class CornerPlane(Contact):
             half_widths.shape in ((), (dim,)),
             f"CornerPlane half_widths must be one length or {dim}; their shape was {half_widths.shape}.",
         )
-        self.half_widths = jnp.broadcast_to(half_widths, (dim,))
+        with at_once_if_known(half_widths):
+            self.half_widths = jnp.broadcast_to(half_widths, (dim,))
         require(
             self.corner_radius.shape == (),
             f"CornerPlane corner_radius must be one length; its shape was {self.corner_radius.shape}.",
         )
-        require_values("half_widths", half_widths, self.half_widths > 0, "positive lengths in m")
-        inside = (self.corner_radius >= 0) & (self.corner_radius <= jnp.min(self.half_widths))
-        require_values("corner_radius", corner_radius, inside, "from zero to the least half width (m)")
-        self.center = jnp.zeros(dim) if center is None else as_floats(center)
+        require_values("half_widths", half_widths, positive, "positive lengths in m")
+        wanted = "from zero to the least half width (m)"
+        require_values("corner_radius", corner_radius, lambda r, h: (r >= 0) & (r <= h.min()), wanted, half_widths)
+        self.center = as_floats(np.zeros(dim) if center is None else center)
         require(
             self.center.shape == (dim,),
             f"CornerPlane center must be {dim} coordinates; its shape was {self.center.shape}.",
         )
-        require_values("center", center, jnp.isfinite(self.center), "finite coordinates in m")
+        if center is not None:
+            require_values("center", center, np.isfinite, "finite coordinates in m")
         each = property_indices("CornerPlane", property, len(self.bodies))
         self.property_index = tuple(p for p in each for _ in range(2**dim))
 
@@ -82,7 +84,7 @@ class CornerPlane(Contact):
         return np.tile(signs, (len(self.bodies), 1))
 
     def _body(self) -> np.ndarray:
-        return np.repeat(self.bodies, 2 ** self.half_widths.shape[0])
+        return np.repeat(np.array(self.bodies, int), 2 ** self.half_widths.shape[0])
 
     def candidates(self, x, radii, table):
         body = self._body()

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, at_once_if_known, require, require_values, whole, whole_numbers
 from carom.contact.geometry import Touch, deepest_direction, sphere_plane, sphere_sphere
 from carom.mechanics.bodies import BodyTable
 
@@ -63,9 +63,9 @@ class Contact(eqx.Module):
 
 def property_indices(name: str, value: int | Sequence[int], count: int) -> tuple[int, ...]:
     """The property index of each of `count` contacts of the family `name`."""
-    if isinstance(value, int):
-        return (value,) * count
-    indices = tuple(int(p) for p in value)
+    if np.ndim(value) == 0:
+        return (whole(f"{name} property", value),) * count
+    indices = whole_numbers(f"{name} property", value)  # pyright: ignore[reportArgumentType]
     require(
         len(indices) == count,
         f"{name} property must be one index or one for each of the {count} contacts; it had {len(indices)}.",
@@ -81,14 +81,16 @@ def _rows(weights: Float[Array, "c p"], frame: Float[Array, "c d d"]) -> Float[A
 def plane(name: str, point, normal) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
     """`point` and unit `normal` of a plane, checked."""
     point, normal = as_floats(point), as_floats(normal)
-    length = jnp.linalg.norm(normal)
     require(
         point.shape == normal.shape and normal.shape in ((2,), (3,)),
         f"{name} point and normal must be vectors of 2 or 3 numbers; their shapes were {point.shape} and "
         f"{normal.shape}.",
     )
-    require_values(f"{name} normal", normal, length > 0, "the direction out of the solid side, which is not zero")
-    return point, normal / length
+    require_values(f"{name} point", point, np.isfinite, "a place in m")
+    wanted = "the direction out of the solid side, which is not zero"
+    require_values(f"{name} normal", normal, lambda n: np.isfinite(n).all() and np.any(n != 0), wanted)
+    with at_once_if_known(normal):
+        return point, normal / jnp.linalg.norm(normal)
 
 
 class DiskDisk(Contact):
@@ -102,13 +104,16 @@ class DiskDisk(Contact):
     property_index: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, pairs: Iterable[tuple[int, int]], property: int | Sequence[int] = 0):
-        self.pairs = tuple((int(a), int(b)) for a, b in pairs)
+        self.pairs = tuple((whole("DiskDisk pairs", a), whole("DiskDisk pairs", b)) for a, b in pairs)
+        seen = set()
         for a, b in self.pairs:
             require(a != b, f"DiskDisk pairs two different bodies; a pair was ({a}, {b}).")
+            require(frozenset((a, b)) not in seen, f"DiskDisk pairs two bodies once; ({a}, {b}) was there twice.")
+            seen.add(frozenset((a, b)))
         self.property_index = property_indices("DiskDisk", property, len(self.pairs))
 
     def candidates(self, x, radii, table):
-        a, b = np.array(self.pairs).T
+        a, b = np.array(self.pairs, int).reshape(-1, 2).T
         centers = np.array(table.center)
         touch = sphere_sphere(x[centers[a]], x[centers[b]], radii[a], radii[b])
         normal = touch.frame[:, 0]
@@ -118,7 +123,7 @@ class DiskDisk(Contact):
         return Candidates(touch.gap, stencil, jnp.concatenate([first, -second], axis=2))
 
     def reach(self, radii):
-        a, b = np.array(self.pairs).T
+        a, b = np.array(self.pairs, int).reshape(-1, 2).T
         return radii[a] + radii[b]
 
     def travel(self, radii):
@@ -147,19 +152,19 @@ class DiskPlane(Contact):
     property_index: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, bodies: Iterable[int], point, normal, property: int | Sequence[int] = 0):
-        self.bodies = tuple(int(b) for b in bodies)
+        self.bodies = whole_numbers("DiskPlane bodies", bodies, once=True)
         self.point, self.normal = plane("DiskPlane", point, normal)
         self.property_index = property_indices("DiskPlane", property, len(self.bodies))
 
     def candidates(self, x, radii, table):
-        body = np.array(self.bodies)
+        body = np.array(self.bodies, int)
         centers = np.array(table.center)[body]
         touch: Touch = sphere_plane(x[centers], radii[body], self.point, self.normal)
         weights = table.weights(x, body, -radii[body][:, None] * self.normal)
         return Candidates(touch.gap, table.stencil(body), _rows(weights, touch.frame))
 
     def reach(self, radii):
-        return radii[np.array(self.bodies)]
+        return radii[np.array(self.bodies, int)]
 
     def travel(self, radii):
         # Nothing is behind a plane, and the gap of a body that moves straight on is a straight line.
@@ -200,7 +205,7 @@ class RimPlane(Contact):
         angles: Sequence[float] | None = None,
         property: int | Sequence[int] = 0,
     ):
-        self.bodies = tuple(int(b) for b in bodies)
+        self.bodies = whole_numbers("RimPlane bodies", bodies, once=True)
         self.point, self.normal = plane("RimPlane", point, normal)
         require(self.normal.shape == (3,), f"RimPlane normal must have 3 numbers; it had {self.normal.shape[0]}.")
         self.angles = None if angles is None else tuple(float(a) for a in angles)
@@ -208,7 +213,7 @@ class RimPlane(Contact):
         self.property_index = property_indices("RimPlane", property, len(self.bodies))
 
     def candidates(self, x, radii, table):
-        body = np.array(self.bodies)
+        body = np.array(self.bodies, int)
         stencil = table.stencil(body)
         center = x[stencil[:, 0]]
         axes = x[stencil[:, 1:]] - center[:, None]
@@ -226,12 +231,12 @@ class RimPlane(Contact):
         return Candidates(touch.gap, stencil, _rows(weights, touch.frame))
 
     def reach(self, radii):
-        return 2 * radii[np.array(self.bodies)]
+        return 2 * radii[np.array(self.bodies, int)]
 
     def travel(self, radii):
         # Less than the arc from one point of the rim to the next: the deepest one changes.
         angle = 0.5 if self.angles is None else min(0.5, np.pi / len(self.angles))
-        return angle * radii[np.array(self.bodies)]
+        return angle * radii[np.array(self.bodies, int)]
 
     def bodies_of(self):
         return tuple((b,) for b in self.bodies)
@@ -247,7 +252,7 @@ def all_candidates(
     contacts: Sequence[Contact], x: Float[Array, "n d"], radii: Float[Array, " bodies"], table: BodyTable
 ) -> Candidates:
     """The candidates of all contact families, in order, with stencils of one width."""
-    parts = [contact.candidates(x, radii, table) for contact in contacts]
+    parts = [contact.candidates(x, radii, table) for contact in contacts if contact.property_index]
     width = max(p.stencil.shape[1] for p in parts)
 
     def widen(part: Candidates) -> Candidates:
@@ -274,8 +279,8 @@ class Active(NamedTuple):
     gap: Float[Array, " K"]
     jacobian: Float[Array, "K d n d"]
     property_index: Int[Array, " K"]
-    index: Int[Array, " K"]  # which candidate each is
-    closed: Bool[Array, " C"]  # which of all candidates these are
+    candidate: Int[Array, " K"]  # which of all candidates each is
+    closed: Bool[Array, " C"]  # the candidates that are here
     overflow: Int[Array, ""]
 
 
@@ -301,7 +306,7 @@ def active_set(
         gap=candidates.gap[order],
         jacobian=jnp.einsum("kipj,kpn->kinj", rows, points),
         property_index=jnp.asarray(property_index)[order],
-        index=order,
+        candidate=order,
         closed=jnp.zeros(closed.shape[0], bool).at[order].set(active),
         overflow=jnp.maximum(jnp.sum(closed) - max_active, 0),
     )

@@ -19,10 +19,9 @@ class ConeSettings(NamedTuple):
     """Knobs of the interior-point method; all are relative to the problem's own scale.
 
     `tolerance` is the largest residual of the optimality conditions (stationarity, complementarity) at which a problem
-    counts as solved. `target` is the residual at which its iterations stop. `diagonal` is delta: what each contact's own block gets, relative to
-    its A_nn.
-    `smoothing` stops at that value of the complementarity products instead of at `target`, which smooths the
-    derivative across the transitions between sticking, sliding and separating.
+    counts as solved. `target` is the residual at which its iterations stop. `diagonal` is delta: what each contact's
+    own block gets, relative to its A_nn. `smoothing` stops at that value of the complementarity products instead of at
+    `target`, which smooths the derivative across the transitions between sticking, sliding and separating.
     """
 
     tolerance: float

@@ -281,6 +281,11 @@ def _batched(settings: ConeSettings, sensitivity: bool):
     return as_one_batch(solve, "cone solver")
 
 
+def solve_cones(A, v, friction, lower, reference) -> Float[Array, "B K d"]:
+    """Impulses of `solve_cone_problem` for what has its own derivative, in the precision of the data."""
+    return _batched(ConeSettings.for_dtype(v.dtype), False)(A, v, friction, lower, reference)[0].impulse
+
+
 def _friction_scale(x, friction):
     """`S x`: the tangential components times mu."""
     return jnp.concatenate([x[..., :1], x[..., 1:] * friction[..., None]], axis=-1)
@@ -366,7 +371,8 @@ def solve_cone_problem(
     relative to the problem's scale. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
     A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is
-    the one of least norm, each contact weighted by its own mobility `A_nn`, but for degenerate problems that only the proximal rounds solve: of these it is one near it.
+    the one of least norm, each contact weighted by its own mobility `A_nn`, but for degenerate problems that only the
+    proximal rounds solve: of these it is one near it.
     The iterations run in double precision where that is enabled, whatever the dtype of the data. Differentiable once,
     in forward and reverse mode.
 

@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
+from carom.contact.cones import solve_cones
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -25,10 +26,13 @@ from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_c
 # inequalities (P. Alart, A. Curnier, A mixed formulation for frictional contact problems, 1991) the law is H(y) = 0,
 #
 #     H_n = y_n - max(lower, y_n - u_n)
-#     H_t = y_t - proj(y_t - rho u_t, disc of radius mu max(lower, y_n - u_n)),    rho = 1 / (largest eigenvalue of A_tt)
+#     H_t = y_t - proj(y_t - rho u_t, disc of radius mu max(lower, y_n - u_n)),    rho = 1 / (a bound of |A_tt|)
 #
-# semi-smooth: sweeps of projected Gauss-Seidel come near to the solution, Newton steps onto the modes that are seen
-# there (open or held by the bound, sticking, sliding) end in it. Where they do not, more sweeps and more steps follow.
+# semi-smooth. The law may have several solutions: what friction can hold may also slip. The start is the solution of the
+# convex program (`cones.py`), whose velocities have the least energy: where something can be held it is held there, and
+# then that is the solution. Newton steps onto the modes that are seen there (open or held by the bound, sticking, sliding)
+# end in it elsewhere. Where they do not, sweeps of projected Gauss-Seidel follow, and steps with a diagonal that is made
+# smaller by and by.
 #
 # Where A is singular the impulse is not unique. A diagonal `delta A_nn` on each contact's own block selects that of
 # least norm, each contact weighted by its own mobility: a norm (an energy) that knows no frame and no unit. A last step
@@ -41,8 +45,8 @@ _CONVERGED = 1e-12
 """Newton steps go on until no |H| is larger."""
 _SWEEPS = 24
 _STEPS = 10
-_ROUNDS = 7
-"""Further rounds where the first tries fail, each with twice the sweeps of the one before."""
+_ROUNDS = 8
+"""Rounds of sweeps and steps, each with twice the sweeps of the one before; most problems take the first, without any."""
 _LENGTHS = (1.0, 0.5, 0.2, 0.05)
 """Shares of a Newton step that are tried."""
 _NEAR_APEX = 1e-5
@@ -149,15 +153,15 @@ def _linear_solve(matrix: Float[Array, "B n n"], rhs: Float[Array, "K d B"]) -> 
     return jnp.moveaxis(jnp.linalg.solve(matrix, flat)[..., 0], 0, -1).reshape(rhs.shape)
 
 
-def _softened(problem: _Problem) -> _Problem:
+def _softened(problem: _Problem, delta=_DELTA) -> _Problem:
     n = problem.Q.shape[0]
-    return problem._replace(Q=problem.Q + _DELTA * jnp.eye(n, dtype=problem.Q.dtype)[..., None])
+    return problem._replace(Q=problem.Q + delta * jnp.eye(n, dtype=problem.Q.dtype)[..., None])
 
 
 def _residual(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, " B"]:
     """Largest |H|: impulses relative to the largest, velocities to the largest term of `Q y + q`.
 
-    Unlike `H` of the modes it is that of the projections, which no mode can hide: an impulse outside of its cone counts.
+    Unlike `H` of the modes no mode can hide it: an impulse outside of its cone counts.
     """
     u = _matvec(problem.Q, y) + problem.q
     modes = _modes(problem, y, u)
@@ -311,70 +315,81 @@ def _sensitivity(problem: _Problem, y: Array, bounded: Array, size: Array, unit:
     )
 
 
-def _solve_block(A, v, friction, lower, reference, *, sensitivity: bool, first: bool):
-    """Solve one block of problems, batch first in and out; the `first` try, or all that is tried after it."""
+class _Search(NamedTuple):
+    swept: Float[Array, "K d B"]
+    y: Float[Array, "K d B"]
+    residual: Float[Array, " B"]
+    round: Int[Array, ""]
+
+
+def _search(problem: _Problem, start: Float[Array, "K d B"], rounds: Int[Array, ""]) -> _Search:
+    """Rounds of sweeps and Newton steps from `start`, until every problem is solved."""
+    soft = _softened(problem)
+
+    def keep_going(search: _Search):
+        return (search.round < rounds) & jnp.any(search.residual > _SOLVED)
+
+    def body(search: _Search) -> _Search:
+        again = search.round > 0
+        swept = _sweep(soft, search.swept, jnp.where(again, _SWEEPS * 2**search.round, 0))
+
+        def smaller(state):
+            y, delta = state
+            return _newton(_softened(problem, delta), y, _STEPS), delta / 10
+
+        # Every other round comes down from a large diagonal, with which there is one solution.
+        first = jnp.where(again & (search.round % 2 == 0), 0.1, _DELTA).astype(swept.dtype)
+        y, _ = jax.lax.while_loop(lambda state: state[1] > 0.5 * _DELTA, smaller, (swept, first))
+        y = _polish(problem, soft, y)
+        residual = _residual(problem, y)
+        better = (residual < search.residual) & (search.residual > _SOLVED)
+        y = jnp.where(better, y, search.y)
+        return _Search(swept, y, jnp.where(better, residual, search.residual), search.round + 1)
+
+    return jax.lax.while_loop(keep_going, body, _Search(start, start, _residual(problem, start), jnp.asarray(0)))
+
+
+def _solve_block(A, v, friction, lower, reference, start, rounds, *, sensitivity: bool):
+    """Solve one block of problems from `start` (N s), batch first in and out."""
     finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction).all(1)
     finite = finite & (lower < jnp.inf).all(1)
     A = jnp.where(finite[:, None, None], A, 0)
-    v = jnp.where(finite[:, None, None], v, 0)
+    v, start = (jnp.where(finite[:, None, None], part, 0) for part in (v, start))
     friction = jnp.where(finite[:, None], friction, 0)
     problem, size, unit = _scale(A, v, friction, jnp.where(finite[:, None], lower, 0), reference)
-    soft = _softened(problem)
-
-    def attempt(y, sweeps):
-        y = _polish(problem, soft, _newton(soft, _sweep(soft, y, sweeps), _STEPS))
-        return y, _residual(problem, y)
-
-    zero = jnp.zeros_like(problem.q)
-    if first:
-        y, residual = attempt(zero, _SWEEPS)
-    else:
-
-        class _Search(NamedTuple):
-            swept: Array
-            y: Array
-            residual: Array
-            round: Array
-
-        def keep_going(search: _Search):
-            return (search.round < _ROUNDS) & jnp.any(search.residual > _SOLVED)
-
-        def body(search: _Search) -> _Search:
-            swept = _sweep(soft, search.swept, 2 * _SWEEPS * 2**search.round)
-            y, residual = attempt(swept, 0)
-            better = (residual < search.residual) & (search.residual > _SOLVED)
-            y = jnp.where(better, y, search.y)
-            return _Search(swept, y, jnp.where(better, residual, search.residual), search.round + 1)
-
-        start = _Search(zero, zero, jnp.full(v.shape[0], jnp.inf, v.dtype), jnp.asarray(0))
-        _, y, residual, _ = jax.lax.while_loop(keep_going, body, start)
+    scale = size[:, None] * unit
+    start = jnp.moveaxis(start, 0, -1) / jnp.where(scale > 0, scale, jnp.inf)
+    found = _search(problem, start, jnp.max(rounds, initial=0))
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
-    solution = CoulombSolution(
-        jnp.moveaxis(y * size[:, None] * unit + nan, -1, 0), jnp.where(finite, residual, jnp.inf)
-    )
-    if not sensitivity:
-        return solution, None
-    return solution, _sensitivity(problem, y, (lower >= 0).T, size, unit)
+    solution = CoulombSolution(jnp.moveaxis(found.y * scale + nan, -1, 0), jnp.where(finite, found.residual, jnp.inf))
+    return solution, _sensitivity(problem, found.y, (lower >= 0).T, size, unit) if sensitivity else None
 
 
 def _solve_batch(A, v, friction, lower, reference, *, sensitivity: bool):
-    """Solve a batch block by block: problems without a contact cost nothing, those with few only their own room."""
+    """Solve a batch block by block: problems without a contact cost nothing, those with few only their own room.
+
+    What the first round does not solve is put together in blocks of its own.
+    """
     batch, k, d = v.shape
     used = contacts_used(A, k)
+    start = solve_cones(A, v, friction, lower, reference)
     solution = CoulombSolution(
         impulse=jnp.zeros((batch, k, d), v.dtype), residual=jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
     )
     out = (solution, _Sensitivity.nothing(batch, k, d, v.dtype) if sensitivity else None)
-    forms = [(True, *form) for form in by_size(used, k)]
-    forms.append((False, k, used > 0))
-    for first, size, chosen in forms:
-        m = size * d
-        arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
-        missing = chosen & ~(out[0].residual <= _SOLVED)
-        solve = functools.partial(_solve_block, sensitivity=sensitivity, first=first)
-        block = next((size for most, size in BLOCK.items() if m <= most), 32)
-        out = solve_chosen(solve, arrays, missing, block, out)
-    return out
+
+    def one_pass(count, out):
+        rounds = jnp.full(batch, jnp.where(count == 0, 1, _ROUNDS))
+        for size, chosen in by_size(used, k):
+            m = size * d
+            arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
+            missing = chosen & ~(out[0].residual <= _SOLVED)
+            block = next((size for most, size in BLOCK.items() if m <= most), 32)
+            solve = functools.partial(_solve_block, sensitivity=sensitivity)
+            out = solve_chosen(solve, (*arrays, start[:, :size], rounds), missing, block, out)
+        return out
+
+    return jax.lax.fori_loop(0, 2, one_pass, out)
 
 
 @functools.cache
@@ -401,7 +416,6 @@ def _impulse(A, v, friction, lower, reference) -> CoulombSolution:
 # that both modes, vmap and jit follow from this rule.
 @_impulse.defjvp
 def _impulse_jvp(primals, tangents):
-    A, *_ = primals
     dA, dv, dfriction, dlower, _ = tangents  # `reference` only sets a scale
     solution, out = _batched(True)(*primals)
     f = solution.impulse
@@ -428,8 +442,8 @@ def solve_coulomb_problem(
     impulses (N s), >= 0, or `None` for zero; `reference` (B, K, d), velocities (m/s) that `v` is what remains of, if
     so: what is small beside them is rounding. An entry of `lower` that is `-inf` is no bound, as `None` is for all.
 
-    A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is the
-    one of least norm, each contact weighted by its own mobility. Differentiable once, in forward and reverse mode.
+    A contact whose normal entry of `A` is zero is padding and gets no impulse. Where the impulse is not unique it is
+    the one of least norm, each contact weighted by its own mobility. Differentiable once, in both modes.
 
     **Source:** Alart and Curnier 1991; Acary and Brogliato, *Numerical Methods for Nonsmooth Dynamical Systems*, 2008.
     """

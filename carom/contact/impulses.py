@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, is_share, not_negative, positive, require, require_values
 from carom.contact.candidates import Active
 from carom.contact.lcp import solve_lcp_impulse
 from carom.contact.phases import two_phases
@@ -76,7 +76,7 @@ class CMr(ContactModel):
     def __init__(self, epsilon: ArrayLike = 0.01):
         epsilon = as_floats(epsilon)
         require(epsilon.ndim == 0, f"epsilon must be one number; its shape was {epsilon.shape}.")
-        require_values("epsilon", epsilon, (epsilon >= 0) & jnp.isfinite(epsilon), "a finite number of at least 0")
+        require_values("epsilon", epsilon, not_negative, "a finite number of at least 0")
         self.epsilon = epsilon
 
     def __call__(self, state, *, smoothing=0.0):
@@ -123,7 +123,7 @@ class Coulomb(ContactModel):
             value = getattr(self, name)
             require(value.shape == (), f"{name} must be one number; its shape was {value.shape}.")
             speed = name == "loss_speed"
-            good = (value > 0) & jnp.isfinite(value) if speed else (value >= 0) & (value <= 1)
+            good = positive if speed else is_share
             require_values(name, value, good, "a positive speed in m/s" if speed else "a share from 0 to 1")
 
     def __call__(self, state, *, smoothing=0.0):
@@ -274,7 +274,7 @@ def consistent_velocity(
 
 
 def _vanishing(matrix: Float[Array, "r r"], d: int) -> Float[Array, " r"]:
-    """A diagonal in place of the limit of none: 4e-10 of each contact's normal entry in double precision, 7e-5 in single."""
+    """A diagonal in place of the limit of none: 4e-10 of each contact's normal entry (7e-5 in single precision)."""
     return jnp.finfo(matrix.dtype).eps ** 0.6 * jnp.repeat(jnp.diag(matrix)[::d], d)
 
 

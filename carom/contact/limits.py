@@ -5,6 +5,7 @@ For a limit, the normal row of the contact Jacobian is the gradient of its gap a
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, positive, require, require_values, whole_numbers
 from carom.contact.candidates import Candidates, Contact, property_indices
 from carom.contact.geometry import bend_gap, stretch_gap
 
@@ -27,12 +28,18 @@ class Chain(eqx.Module):
     anchor: Float[Array, " 2"] | None
 
     def __init__(self, bodies: Sequence[int], anchor=None):
-        self.bodies = tuple(int(b) for b in bodies)
+        self.bodies = whole_numbers("chain bodies", bodies)
+        require(
+            all(a != b for a, b in pairwise(self.bodies)),
+            f"a chain joins different bodies; neighbours of {self.bodies} were the same.",
+        )
         self.anchor = None if anchor is None else as_floats(anchor)
         require(
             self.anchor is None or self.anchor.shape == (2,),
             "anchor must be a point of 2 numbers, or None; it was of another shape.",
         )
+        if anchor is not None:
+            require_values("anchor", anchor, np.isfinite, "finite coordinates in m")
 
     def windows(self, length: int) -> Int[np.ndarray, "c length"]:
         """All runs of `length` neighbours; -1 is the anchor."""
@@ -75,7 +82,7 @@ class BendLimit(Contact):
 
     def __init__(self, bodies: Sequence[int], limit, anchor=None, property: int | Sequence[int] = 0):
         self.chain, self.limit = Chain(bodies, anchor), as_floats(limit)
-        require_values("limit", limit, (self.limit > 0) & (self.limit <= jnp.pi), "an angle in (0, pi] rad")
+        require_values("limit", limit, lambda a: (a > 0) & (a <= np.pi), "an angle in (0, pi] rad")
         self.property_index = property_indices("BendLimit", property, len(self.chain.windows(3)))
 
     def candidates(self, x, radii, table):
@@ -112,8 +119,8 @@ class StretchLimit(Contact):
 
     def __init__(self, bodies: Sequence[int], shortest, longest, anchor=None, property: int | Sequence[int] = 0):
         self.chain, self.shortest, self.longest = Chain(bodies, anchor), as_floats(shortest), as_floats(longest)
-        require_values("shortest", shortest, self.shortest > 0, "a positive number of metres")
-        require_values("longest", longest, self.longest > self.shortest, "longer than shortest")
+        require_values("shortest", shortest, positive, "a positive number of metres")
+        require_values("longest", longest, lambda most, least: most > least, "longer than shortest", shortest)
         self.property_index = property_indices("StretchLimit", property, len(self.chain.windows(2)))
 
     def candidates(self, x, radii, table):

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from carom.checks import is_known, require, require_values
+from carom.checks import is_known, not_negative, require, require_values
 from carom.contact.cones import ConeSettings, solve_cone_problem
 from carom.contact.coulomb import solve_coulomb_problem
 
@@ -61,7 +62,7 @@ def contact_impulse(
     **Source:** paper, S.14 and S.15.
     """
     _check_problem(A, v, friction=friction, restitution=restitution, v_star=v_star)
-    require_values("restitution", restitution, restitution <= 1, "between 0 and 1")
+    require_values("restitution", restitution, lambda e: e <= 1, "between 0 and 1")
     compression, rebound = two_phases(A, v, friction, restitution, v_star, smoothing=smoothing)
     _check_solved(compression, v.dtype)
     _check_solved(rebound, v.dtype)
@@ -92,8 +93,8 @@ def two_phases(
 
     `diagonal` (..., K d) is added to that of A in the convex programs alone, not where velocities are computed.
     `coulomb`: each phase obeys Coulomb's law, in place of the convex programs (see `Coulomb`). `reference` (..., K, d):
-    velocities (m/s) beside which others are rounding; `v` itself by default. Where it does not rebound, the second phase
-    is nothing, and costs nothing.
+    velocities (m/s) beside which others are rounding; `v` itself by default. Without `rebounds` the second phase is
+    nothing, and costs nothing.
     """
     reference = v if reference is None else reference
     program = A if diagonal is None else A + diagonal[..., None] * jnp.eye(A.shape[-1], dtype=A.dtype)
@@ -142,9 +143,9 @@ def _check_problem(A, v, *, friction, **others):
             value.shape == shape, f"{name} must have the shape {shape} to go with v {v.shape}; it was {value.shape}."
         )
     for name, value in {"A": A, "v": v, "friction": friction, **others}.items():
-        require_values(name, value, jnp.isfinite(value), "finite")
+        require_values(name, value, np.isfinite, "finite")
         if name not in ("A", "v", "v_star"):
-            require_values(name, value, value >= 0, "at least 0")
+            require_values(name, value, not_negative, "at least 0")
 
 
 def _check_solved(solution: Phase, dtype):

@@ -84,6 +84,11 @@ class LearnConfig:
         return 2 if self.model in BASELINES else 5
 
     @property
+    def learns_contact(self) -> bool:
+        """Whether friction and restitution, or a network in place of the contact model, are to be learned."""
+        return bool({"friction", "restitution"} & set(self.learn)) and self.model != "in-cp-sp"
+
+    @property
     def steps_per_epoch(self) -> int:
         """Steps of the optimiser in an epoch."""
         return -(-self.chunks_per_epoch // self.batch_size)

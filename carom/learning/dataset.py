@@ -1,6 +1,7 @@
 """Training data: short chunks of recorded trajectories, about half of them with a contact."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +12,9 @@ from carom.checks import require
 from carom.simulation.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
+
+PIECES = 10
+"""Into how many pieces of equal length a single trajectory is cut."""
 
 
 class Chunks(eqx.Module):
@@ -76,7 +80,8 @@ class Dataset(eqx.Module):
         )
         require(
             abs(self.train.dt - self.val.dt) <= 1e-6 * self.train.dt,
-            f"train and val must have one time step; they had {self.train.dt} s and {self.val.dt} s.",
+            f"train and val must have one time step; they had {self.train.dt} s and {self.val.dt} s. If that is the "
+            "rounding of their times, write more digits, or both into one file to be split.",
         )
 
     @classmethod
@@ -86,14 +91,56 @@ class Dataset(eqx.Module):
         Where they are of several sessions (`group`), each session stays whole, and `val` is a share of the sessions.
         """
         n = recording.n_trajectories
-        require(n >= 2, f"a recording must have at least 2 trajectories to be split; it had {n}.")
+        require(
+            n >= 2,
+            f"a recording must have at least 2 trajectories to be split; it had {n}. Cut it into pieces first: "
+            f"recording.cut(samples), with up to {int(recording.length.max()) // 2} samples each.",
+        )
         require(0 < val < 1, f"val must be a share between 0 and 1; it was {val}.")
-        each = np.arange(n) if recording.group is None else recording.group
-        sessions = np.unique(each)
-        require(len(sessions) >= 2, "a recording of one session cannot be split: give a file to validate on.")
-        order = np.random.default_rng(seed).permutation(sessions)
-        held = np.isin(each, order[: min(max(1, round(val * len(sessions))), len(sessions) - 1)])
+        sessions = len(np.unique(sessions_of(recording)))
+        require(sessions >= 2, "a recording of one session cannot be split: give a file to validate on.")
+        held = hold_out(recording, val, np.random.default_rng(seed))
         return cls(recording.select(~held), recording.select(held))
+
+
+def in_pieces(recording: Recording, least: int, shortest: int) -> tuple[Recording, str]:
+    """A recording of at least `least` trajectories: as it is, or cut into pieces; and a word about that, or "".
+
+    **Arguments:** `shortest`, the least number of samples of a piece.
+
+    **Raises:** `CaromError` for a recording that is too short to cut.
+    """
+    n, longest = recording.n_trajectories, int(recording.length.max())
+    if n >= least:
+        return recording, ""
+    samples = max(int(recording.length.sum()) // PIECES, shortest)
+    found = int(np.sum(recording.length // samples))
+    require(
+        found >= least,
+        f"data must hold at least {least} trajectories to learn from and to be tested with; it held {n} of up to "
+        f"{longest} samples, which is too little to cut into pieces of {shortest}. Record more.",
+    )
+    # Pieces of one session must be divided here, for want of another.
+    pieces = replace(recording.cut(samples), group=None)
+    return pieces, (
+        f"The data have {n} {'trajectory' if n == 1 else 'trajectories'} of up to {longest} samples: cut into {found} "
+        f"pieces of {samples}. Several motions from different starts would tell more."
+    )
+
+
+def sessions_of(recording: Recording) -> Int[np.ndarray, " N"]:
+    """Each trajectory's session (`group`); each is one of its own where that was not recorded."""
+    return np.arange(recording.n_trajectories) if recording.group is None else recording.group
+
+
+def hold_out(recording: Recording, share: float, rng: np.random.Generator) -> Bool[np.ndarray, " N"]:
+    """Which trajectories to hold out: all of a `share` of the sessions, of at least one and never of all.
+
+    Trajectories of one session are alike, so that none may be learned from where another is held out.
+    """
+    each = sessions_of(recording)
+    order = rng.permutation(np.unique(each))
+    return np.isin(each, order[: min(max(1, round(share * len(order))), len(order) - 1)])
 
 
 def contact_flags(recording: Recording, system: System) -> Bool[np.ndarray, "N T"]:
@@ -132,11 +179,21 @@ def closing(recording: Recording, system: System) -> Int[np.ndarray, " P"]:
     return out
 
 
+def properties_closed(x: Float[np.ndarray, "S n d"], system: System) -> Bool[np.ndarray, "S P"]:
+    """Of which contact properties a contact is closed, by state."""
+    out = np.zeros((len(x), system.n_properties), bool)
+    if system.contacts and len(x):
+        index = np.array([p for contact in system.contacts for p in contact.property_index])
+        states, contacts = np.nonzero(np.asarray(_gaps(system, jnp.asarray(x))) < 0)
+        out[states, index[contacts]] = True
+    return out
+
+
 def recording_of(trajectory: Trajectory, *, task: str = "", source: str = "") -> Recording:
-    """A batch of simulated trajectories as a recording, to learn from or to write to a file."""
-    return Recording.of(
-        trajectory.x, trajectory.v, time=trajectory.time, contact=trajectory.contact, task=task, source=source
-    )
+    """Simulated trajectories, or a single one, as a recording, to learn from or to write to a file."""
+    x, v = (part.reshape(-1, *part.shape[-3:]) for part in (trajectory.x, trajectory.v))
+    contact = trajectory.contact.reshape(-1, trajectory.contact.shape[-1])
+    return Recording.of(x, v, time=trajectory.time, contact=contact, task=task, source=source)
 
 
 def trajectory_of(recording: Recording, k: int) -> Trajectory:

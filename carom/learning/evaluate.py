@@ -11,6 +11,7 @@ from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.impact import COMPENSATION_STEPS
 from carom.simulation.recording import Recording, check_system
+from carom.simulation.recording_checks import state_noise
 from carom.simulation.rollout import Trajectory, simulate
 from carom.system import System
 
@@ -73,6 +74,26 @@ def energy_errors(recording: Recording, predicted: Trajectory, truth: System) ->
     return np.where(recording.valid, error, np.nan)
 
 
+FAR_OFF = 0.1
+"""Predictions that are off by a larger share do not explain the data, unless noise may be why."""
+NOISE_GROWS = 5.0
+"""By which the noise of a start may have grown, as a share of the state, in the mean over a prediction."""
+
+
+def error_allowed(recording: Recording) -> float:
+    """The largest relative error of predictions that explain a recording: see docs/identifiability.md."""
+    return max(FAR_OFF, NOISE_GROWS * state_noise(recording))
+
+
+def far_off(measures: dict[str, Any]) -> bool:
+    """Whether predictions do not explain the data: too many are off, not only a few that are lost.
+
+    Of the trajectories' errors the median is judged, which a few do not move, and the mean of the bounded form.
+    """
+    errors = (measures["trajectory_error_median"], measures["bounded_error"])
+    return not all(error <= measures["error_allowed"] for error in errors)
+
+
 def mean_and_interval(errors: Float[np.ndarray, "N T"]) -> dict[str, list[float]]:
     """At each time, the mean over trajectories (those that last so long), and half of its 95 % interval."""
     count = np.maximum(np.sum(~np.isnan(errors), axis=0), 1)
@@ -101,6 +122,7 @@ def evaluate(
     - `trajectory_error`: mean over time, then over trajectories, of the relative error, with `_ci95`, half of the 95 %
       interval of that mean; `_median` over trajectories; `_geometric`, geometric mean over time, mean over
       trajectories; `bounded_error`: mean of the bounded form.
+    - `error_allowed`: above which predictions do not explain the data (see `far_off`).
     - `energy_drift`: largest `|E - E_0| / max |E|` along predictions of a system that keeps energy, by the true system.
     - `constraint_error`: largest `|Phi|` (m^2).
     - `friction_error`, `restitution_error` (absolute, by property) and `mass_ratio_error` (relative, by body), of
@@ -113,7 +135,7 @@ def evaluate(
     relative, bounded = state_errors(recording, predicted)
     later, later_bounded = relative[:, 1:], bounded[:, 1:]
     per_trajectory = np.nanmean(later, axis=1)
-    count = len(per_trajectory)
+    count, valid = len(per_trajectory), recording.valid  # a prediction goes on where its trajectory has ended
     out: dict[str, Any] = {
         "trajectories": count,
         "steps": int(recording.length.max()) - 1,
@@ -122,8 +144,9 @@ def evaluate(
         "trajectory_error_median": float(np.median(per_trajectory)),
         "trajectory_error_geometric": float(np.mean(np.exp(np.nanmean(np.log(np.maximum(later, 1e-16)), axis=1)))),
         "bounded_error": float(np.mean(np.nanmean(later_bounded, axis=1))),
-        "constraint_error": float(np.max(np.abs(np.asarray(system.constraints(predicted.x))), initial=0.0)),
-        "overflowed_contacts": int(np.sum(predicted.overflow)),
+        "error_allowed": error_allowed(recording),
+        "constraint_error": float(np.max(np.abs(np.asarray(system.constraints(predicted.x)))[valid], initial=0.0)),
+        "overflowed_contacts": int(np.sum(np.asarray(predicted.overflow)[valid])),
     }
     if truth is not None:
         known = physical_quantities(system)
@@ -134,5 +157,6 @@ def evaluate(
             out["mass_ratio_error"] = np.abs(mass_ratios(system) / mass_ratios(truth) - 1).tolist()
         if np.all(np.asarray(truth.restitution) == 1) and np.all(np.asarray(truth.friction) == 0):
             energy = np.asarray(truth.energy(predicted.x, predicted.v))
-            out["energy_drift"] = float(np.max(np.abs(energy - energy[:, :1])) / np.max(np.abs(energy)))
+            drift = np.abs(energy - energy[:, :1])[valid]
+            out["energy_drift"] = float(np.max(drift) / np.max(np.abs(energy[valid])))
     return out, predicted

@@ -22,7 +22,10 @@ trade; its other layers are held. The values reported (`refined`) are this estim
 Friction is told by impacts that slide: a contact that sticks only says that its friction is at least the ratio of
 tangential to normal impulse that held it. Restitution is told by impacts whose rebound it decides: where the contact
 model's target velocity, which undoes the penetration, is the greater, it is only said to be at most the ratio of
-rebound to compression. A bound that leaves as little room as a standard error may have counts as identified (e = 0).
+rebound to compression. However tight, that is a bound (e = 0 is said by "<= 0.02"), and never "identified".
+
+An impact counts where the data show it: a contact of the property overlaps at the recorded end of the step, not only at
+the predicted one. Recordings whose impacts happen between the samples are refused (`meetings.py`).
 """
 
 import dataclasses
@@ -34,7 +37,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from carom.checks import require
-from carom.learning.dataset import closing
+from carom.learning.dataset import closing, properties_closed
+from carom.learning.meetings import check_meetings
 from carom.learning.models import Unknowns
 from carom.learning.parameters import unknowns_of
 from carom.learning.refine import (
@@ -105,7 +109,8 @@ def identify(
     **Arguments:** `system`, a learned one: its values are where the estimator starts; `recording`, the data it was
     learned from, or others; `learned`, what was unknown; the rest as in `LearnConfig`.
 
-    **Raises:** `CaromError` if no step starts without contact, or the system has more than `MOST_POINTS` points.
+    **Raises:** `CaromError` if no step starts without contact, the system has more than `MOST_POINTS` points, or
+    friction and restitution are asked for of a recording whose impacts happen between the samples.
     """
     config = IdentifyConfig() if config is None else config
     require(
@@ -113,6 +118,8 @@ def identify(
         f"identify is for systems of up to {MOST_POINTS} points; this one has {system.n_points}.",
     )
     check_system(recording, system)
+    if {"friction", "restitution"} & set(learned):
+        check_meetings(recording, system)
     stepper = Stepper(
         dt=jnp.asarray(recording.dt),
         formulation=formulation,
@@ -126,14 +133,16 @@ def identify(
     if shooting is not None:
         fitted, errors = shoot(shooting, unknowns)
         problem = new_problem(fitted, system, stepper, shooting.states(), config)
-        seen = sensitivities(problem, fitted)
-        weight = np.ones(len(problem.steps))
+        require(len(problem.steps) > 0, "no window of the recording has a step that starts without contact.")
+        seen, steps = sensitivities(problem, fitted), problem.steps
+        weight, states = np.ones(len(steps)), shooting.windows.x
     else:
         problem = new_problem(unknowns, system, stepper, recording, config)
         require(len(problem.steps) > 0, "the recording has no step that starts without contact.")
-        fitted, solution, seen = refine(problem, config)
-        errors, weight = solution.standard_error, solution.weight
-    contact = count_contacts(system.n_properties, seen, weight)
+        fitted, solution, seen, steps = refine(problem, config)
+        errors, weight, states = solution.standard_error, solution.weight, recording.x
+    closed = properties_closed(states[steps[:, 0], steps[:, 1] + 1], system)
+    contact = count_contacts(system.n_properties, seen, weight, closed)
     return Identification(
         impacts=impacts.tolist(),
         **{name: contact[name].tolist() for name in ("used", "sliding", "sticking")},
@@ -144,13 +153,16 @@ def identify(
     )
 
 
-def count_contacts(P: int, seen: StepSensitivity, weight: Float[np.ndarray, " S"]) -> dict[str, Any]:
+def count_contacts(
+    P: int, seen: StepSensitivity, weight: Float[np.ndarray, " S"], overlap: Bool[np.ndarray, "S P"]
+) -> dict[str, Any]:
     """By property (P of them), in how many steps its contacts act, and which of its quantities they tell; the bounds.
 
-    A step tells of a quantity if the motion after it depends on it. Those that do not fit (weight below a quarter) do
-    not count.
+    A step tells of a quantity if the motion after it depends on it. Those do not count that do not fit (weight below a
+    quarter), or whose recorded end shows no `overlap` of a contact of the property.
     """
-    closed = (seen.property < P) & (weight > 0.25)[:, None]
+    shown = np.pad(overlap, ((0, 0), (0, 1)))[np.arange(len(overlap))[:, None], seen.property]
+    closed = shown & (weight > 0.25)[:, None]
     total = seen.normal.sum(axis=1)
     acting = closed & (total > 1e-6 * total.max(initial=0.0)) if seen.normal.shape[1] else closed
     slides, feels = (acting & _depends(np.asarray(part), seen, P) for part in (seen.friction, seen.restitution))
@@ -231,7 +243,6 @@ def _restitution(fitted, errors, contact, config: IdentifyConfig) -> list[Estima
         verdict = "identified" if told else "bounded above" if bounded else "not identified"
         if bounded:
             lower, upper, error = 0.0, float(allowed), float(allowed) / 1.96
-            verdict = "identified" if error <= config.max_standard_error else verdict
         out.append(Estimate(value, error, lower, upper, verdict, int(felt), float(allowed) if bounded else None))
     return out
 

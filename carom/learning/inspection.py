@@ -10,7 +10,9 @@ from carom.contact.limits import BendLimit, StretchLimit
 from carom.learning.config import LearnConfig
 from carom.learning.data_checks import LARGEST_DRIFT
 from carom.learning.dataset import Chunks, all_gaps, closing, contact_flags
+from carom.learning.meetings import meetings
 from carom.learning.refine import IdentifyConfig
+from carom.learning.tosses import can_learn_tosses
 from carom.mechanics.constraints import Rigid
 from carom.mechanics.potentials import Gravity
 from carom.simulation.recording import Recording, check_system
@@ -18,7 +20,7 @@ from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
 
 LOOSE = 1e-3
-"""Constraints that are off by more (m^2) deserve a look; `learn` refuses what is off by `LARGEST_DRIFT`."""
+"""Constraints that are off by more, relative to what they hold, deserve a look; see `LARGEST_DRIFT`."""
 
 
 class Inspection(NamedTuple):
@@ -44,6 +46,7 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
     closings = closing(recording, system)
     if system.contacts:
         out.append(_depth(recording, system))
+        out += _meetings(recording, system)
     closed = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
     more = (_step_length(recording, system), _free_fall(recording, system, closed))
     out += [finding for finding in more if finding is not None]
@@ -55,11 +58,11 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
 
 
 def _constraints(recording: Recording, system: System) -> Finding:
-    off = np.abs(np.asarray(system.constraints(jnp.asarray(recording.x[recording.valid]))))
+    off = np.abs(np.asarray(system.violation(jnp.asarray(recording.x[recording.valid]))))
     worst = float(off.max(initial=0.0))
     advice = "" if worst <= LOOSE else "lengths of rods, units or the order of points may be wrong"
     advice += "; `learn` refuses it" if worst > LARGEST_DRIFT else ""
-    return Finding("rods and joints are off by", f"{worst:.1e} m^2, median {np.median(off):.0e}", advice)
+    return Finding("rods and joints are off by", f"{worst:.1e} of what they hold, median {np.median(off):.0e}", advice)
 
 
 def _depth(recording: Recording, system: System) -> Finding:
@@ -67,14 +70,25 @@ def _depth(recording: Recording, system: System) -> Finding:
     reach, deepest, place, states = np.asarray(system.reach()), 0.0, "", 0
     count = 0
     for k, (gaps, length) in enumerate(zip(all_gaps(recording.x, system), recording.length, strict=True)):
-        share = -gaps[:length] / reach
-        states += int((share > 0).any(axis=1).sum())
+        depth = -gaps[:length]
+        states += int((depth > 0).any(axis=1).sum())
+        share = np.divide(depth, reach, out=np.zeros_like(depth), where=reach > 0)  # points have none
         count += int(length)
         if share.max(initial=0.0) > deepest:
             deepest = float(share.max())
             place = f" (trajectory {k}, sample {int(share.max(axis=1).argmax())})"
     advice = f"bodies are through walls or each other{place}: check radii, walls and units" if deepest > 1 else ""
     return Finding("states in contact", f"{states / count:.0%}, the deepest {deepest:.0%} of what can be", advice)
+
+
+def _meetings(recording: Recording, system: System) -> list[Finding]:
+    """Whether impacts are at the samples; nothing of bodies that never meet. Tosses are learned in either case."""
+    found = meetings(recording, system)
+    if not sum(found):
+        return []
+    steps = found.not_seen and not can_learn_tosses(system)
+    advice = "impacts happen between the samples: friction and restitution cannot be learned" if steps else ""
+    return [Finding("where bodies meet", str(found), advice)]
 
 
 def _step_length(recording: Recording, system: System) -> Finding | None:

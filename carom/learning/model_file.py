@@ -16,7 +16,7 @@ from carom.contact.impulses import CONTACT_MODELS, ContactModel, contact_model_n
 from carom.errors import CaromError
 from carom.learning.baselines import describe_baseline, rebuild_baseline
 from carom.learning.models import NeuralPotential
-from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.system import System
 
 MAGIC = b"carom model 1\n"
@@ -28,11 +28,12 @@ def save_model(
     *,
     formulation: str = "lagrangian",
     compensation_steps: float | None = COMPENSATION_STEPS,
+    impact: ImpactRule = "step",
 ) -> None:
     """Save a learned system. To load it again, its skeleton is needed (a task's is found by its name).
 
-    **Arguments:** `path`, of the file; `system`, with its contact model; `formulation` and `compensation_steps`, how
-    it was simulated when it was learned.
+    **Arguments:** `path`, of the file; `system`, with its contact model; `formulation`, `compensation_steps` and
+    `impact`, how it was simulated when it was learned.
 
     **Raises:** `CaromError` if the file cannot be written.
     """
@@ -45,6 +46,7 @@ def save_model(
         "points": system.n_points,
         "dim": system.dim,
         "compensation_steps": compensation_steps,
+        "impact": impact,
         "contact_model": {
             "name": contact_model_name(system.contact_model),
             **contact_model_settings(system.contact_model),
@@ -68,7 +70,7 @@ def save_model(
 
 
 NEEDED = {"task", "formulation", "points", "dim", "network", "sha256"}
-KEYS = NEEDED | {"compensation_steps", "contact_model", "potential", "baseline", "header_sha256"}
+KEYS = NEEDED | {"compensation_steps", "impact", "contact_model", "potential", "baseline", "header_sha256"}
 """What a header may have; older files lack some."""
 
 
@@ -79,8 +81,8 @@ def _header_checksum(header: dict[str, Any]) -> str:
 
 
 def read_model_header(path: str | Path) -> dict[str, Any]:
-    """What a model file says of itself: task, formulation, compensation steps, contact model, sizes."""
-    return {"compensation_steps": COMPENSATION_STEPS, **_read(Path(path))[0]}
+    """What a model file says of itself: task, formulation, compensation steps, impacts, contact model, sizes."""
+    return {"compensation_steps": COMPENSATION_STEPS, "impact": "step", **_read(Path(path))[0]}
 
 
 def load_model_into(path: str | Path, skeleton: System) -> System:

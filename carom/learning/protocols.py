@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from carom.checks import require
 from carom.contact.boxes import CornerPlane
-from carom.mechanics.bodies import recover_pose
+from carom.mechanics.bodies import RigidBody
 from carom.simulation.recording import Recording
 from carom.system import System
 
@@ -46,21 +46,27 @@ def pose_errors(
     return tuple(np.where(valid, part, 0).sum(axis=1) / valid.sum(axis=1) for part in (distance, angle))  # pyright: ignore[reportReturnType]
 
 
-def protocol_starts(recording: Recording, protocol: Protocol, width: float) -> Recording:
+def protocol_starts(
+    recording: Recording, protocol: Protocol, height: float, moments: Float[np.ndarray, " 3"] | None = None
+) -> Recording:
     """The recording as a protocol predicts it: each toss from the sample that it starts from.
 
-    A: the first sample. B: the sample before the centre first falls below `sqrt(3) / 2 width`, the height at which a
-    corner can touch, with the velocities refitted on the flight before it (Acosta, Yang, Posa, RA-L 2022).
+    A: the first sample. B: the sample before the centre first falls below `height` (m), at which a corner can touch
+    (half of the box's diagonal), with the velocities refitted on the flight before it (Acosta, Yang, Posa, RA-L 2022).
+    In flight a body keeps its angular momentum, for which its second `moments` are needed, but for a common factor;
+    without them it turns like a cube, at one rate.
     """
     require(protocol in ("A", "B"), f"protocol must be A or B; it was {protocol!r}.")
     if protocol == "A":
         return recording
+    second = np.ones(3) if moments is None else np.asarray(moments)
+    inertia = np.sum(second) - second  # I_x = mu_y + mu_z and so on
     starts, states = [], []
     for k, length in enumerate(recording.length):
-        low = recording.x[k, :length, 0, 2] < np.sqrt(3) / 2 * width
+        low = recording.x[k, :length, 0, 2] < height
         start = max(int(low.argmax()) - 1, 0) if low.any() else 0
         starts.append(start)
-        states.append(_flight_velocity(recording.x[k, : start + 1], recording.v[k, start], recording.dt))
+        states.append(_flight_velocity(recording.x[k, : start + 1], recording.v[k, start], recording.dt, inertia))
     length = recording.length - np.array(starts)
     rows = (np.array(starts)[:, None] + np.arange(length.max())).clip(max=recording.x.shape[1] - 1)
     x, v = (part[np.arange(len(starts))[:, None], rows] for part in (recording.x, recording.v))
@@ -70,18 +76,36 @@ def protocol_starts(recording: Recording, protocol: Protocol, width: float) -> R
     )
 
 
-def _flight_velocity(x: Float[np.ndarray, "t 4 3"], recorded: Float[np.ndarray, "4 3"], dt: float):
-    """Velocities of the points at the end of a flight: a parabola for the centre, one rate of turning for the axes."""
+def _flight_velocity(
+    x: Float[np.ndarray, "t 4 3"], recorded: Float[np.ndarray, "4 3"], dt: float, inertia: Float[np.ndarray, " 3"]
+):
+    """Velocities of the points at the end of a flight: a parabola for the centre, one angular momentum for the axes.
+
+    `inertia` holds the principal moments of inertia, in any unit.
+    """
     if len(x) < 4:
         return recorded
     from scipy.spatial.transform import Rotation
 
     time = (np.arange(len(x)) - len(x) + 1) * dt
     center = np.polyfit(time, x[:, 0], 2)[1]
-    _, rotation = (np.asarray(part) for part in recover_pose(jnp.asarray(x)))
-    turns = (Rotation.from_matrix(rotation) * Rotation.from_matrix(rotation[-1]).inv()).as_rotvec()
-    omega = np.sum(turns * time[:, None], axis=0) / np.sum(time**2)
+    turn = Rotation.from_matrix(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2))  # the nearest rotations to the axes
+    # A rotation vector has no more than half a turn: so from sample to sample, however far the whole flight turns.
+    # These weights make the mean of a body that turns at one rate the slope of its angle's straight line of least
+    # squares through the last sample, sum t phi(t) / sum t^2.
+    steps = (turn[1:] * turn[:-1].inv()).as_rotvec()
+    weights = np.cumsum(-time[:-1])
+    halfway = (Rotation.from_rotvec(steps / 2) * turn[:-1]).as_matrix()
+    momentum = weights @ _turned(halfway, inertia, steps / dt) / weights.sum()
+    omega = _turned(turn[-1].as_matrix(), 1 / inertia, momentum)
     return center + np.concatenate([np.zeros((1, 3)), np.cross(omega, x[-1, 1:] - x[-1, :1])])
+
+
+def _turned(
+    rotation: Float[np.ndarray, "*t 3 3"], diagonal: Float[np.ndarray, " 3"], vector: Float[np.ndarray, "*t 3"]
+):
+    """`R diag(d) R^T u`: what is diagonal in the body's frame, on vectors of the world's."""
+    return np.einsum("...ij,j,...kj,...k->...i", rotation, diagonal, rotation, vector)
 
 
 def body_points(system: System, box: Float[Array, "... 4 3"]) -> Float[Array, "... 4 3"]:
@@ -123,6 +147,13 @@ def box_of(system: System) -> CornerPlane:
     found = [contact for contact in system.contacts if isinstance(contact, CornerPlane)]
     require(len(found) > 0, "protocols A and B are for tossed boxes; this system has no CornerPlane contact.")
     return found[0]
+
+
+def moments_of(system: System) -> Float[np.ndarray, " 3"]:
+    """Second moments (kg m^2) of the one body that is tossed."""
+    (body,) = system.bodies
+    assert isinstance(body, RigidBody)
+    return np.asarray(body.moments)
 
 
 def paired_difference(

@@ -48,7 +48,7 @@ class IdentifyConfig:
     doubt: float = 2.0
     """Steps are left out in which a gap is nearer to zero than so many standard deviations of its error."""
     min_impacts: int = 10
-    """Fewer impacts that speak about a quantity do not identify it, whatever their standard error."""
+    """Fewer recorded impacts that speak about a quantity do not identify it, whatever their standard error."""
     max_standard_error: float = 0.05
     """A quantity with a larger standard error (of mass ratios: relative) is not identified."""
     directions: int = 100
@@ -123,13 +123,15 @@ def _accelerations(potential: NeuralPotential, system: System, x: Float[Array, "
 
 
 def principal_directions(unknowns: Unknowns, system: System, recording: Recording, steps, config: IdentifyConfig):
-    """The principal directions (W, F) of a potential's linear weights, by what they do; F = 0 without a potential.
+    """The principal directions (W, F) of a potential's linear weights, by what they do.
+
+    F = 0 without a potential, and without a step to look at.
 
     At most `config.directions`, with a root mean square acceleration of at least `smallest_force` of the largest one's:
     forces that joints take up do nothing.
     """
-    if unknowns.potential is None:
-        return np.zeros((0, 0))
+    if unknowns.potential is None or not len(steps):
+        return np.zeros((len(linear_weights(unknowns)), 0))
     x = jnp.asarray(recording.x[steps[:, 0], steps[:, 1]][:: max(1, len(steps) // 500)])
     done = np.array(_accelerations(unknowns.potential, unknowns.assemble(system), x))
     done = done.reshape(-1, done.shape[-1])
@@ -173,11 +175,12 @@ def new_problem(
 
 
 class Refined(NamedTuple):
-    """The parameters of the robust estimator, its last solution, and the steps with their last linearisation."""
+    """The parameters of the robust estimator, its last solution, and its steps with their last linearisation."""
 
     unknowns: Unknowns
     solution: Solution
     seen: StepSensitivity
+    steps: Int[np.ndarray, "S 2"]
 
 
 def refinements(problem: Problem, config: IdentifyConfig) -> Iterator[Refined]:
@@ -218,7 +221,7 @@ def refinements(problem: Problem, config: IdentifyConfig) -> Iterator[Refined]:
         )
         changed = changed + solution.change
         unknowns = moved(problem.unknowns, problem.features, changed)
-        yield Refined(unknowns, solution, seen)
+        yield Refined(unknowns, solution, seen, problem.steps[kept])
         seen = sensitivities(problem, unknowns)
         if not config.redescend:
             errors = _errors(seen, problem.recording)

@@ -107,6 +107,8 @@ def _spectrum(H, prior):
 
     There the prior decides alone: rounding of data that are almost exact is greater than all that it says.
     """
+    if not len(H):
+        return np.zeros((0, 0)), np.zeros(0), np.zeros(0, bool)
     scale = 1 / np.sqrt(np.diag(H + prior))
     values, vectors = np.linalg.eigh(scale[:, None] * (H + prior) * scale)
     directions = scale[:, None] * vectors

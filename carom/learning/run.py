@@ -172,12 +172,16 @@ class RunFolder:
 
 def check_same_settings(what: str, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raise `CaromError` if `what` would go on with other settings than it was started with, which JSON has kept."""
-    for name in now:
-        new = list(now[name]) if isinstance(now[name], tuple) else now[name]
+    # What JSON makes of settings: lists of tuples, at any depth.
+    for name, new in json.loads(json.dumps(_finite(now))).items():
+        old = before.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            check_same_settings(what, old, new)
+            continue
         require(
-            before.get(name) == new,
-            f"{what} was started with {name} = {before.get(name)!r}, not {new!r}. Use the same options to go on with "
-            "it, or another --out.",
+            old == new,
+            f"{what} was started with {name} = {old!r}, not {new!r}. Use the same options to go on with it, or another "
+            "--out.",
         )
 
 

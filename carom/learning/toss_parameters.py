@@ -52,6 +52,24 @@ def _leaf(where: Callable[[System], Any], scale: float, unit: str, lower=0.0, up
     return Parameter(lambda system: where(system).reshape(-1)[0], write, lower, upper, scale, unit)
 
 
+def _half_width(system: System, value):
+    """The mean half width; a box keeps its proportions."""
+    half = box_of(system).half_widths
+    return eqx.tree_at(lambda s: box_of(s).half_widths, system, half * value / jnp.mean(half))
+
+
+def _of_box(where: Callable[[Any], Any], scale: float, upper: float) -> Parameter:
+    """The box's own value of a contact property; those of other contacts stay."""
+
+    def index(system: System) -> int:
+        return box_of(system).property_index[0]
+
+    def write(system: System, value):
+        return eqx.tree_at(where, system, where(system).at[index(system)].set(value))
+
+    return Parameter(lambda system: where(system)[index(system)], write, 0.0, upper, scale, "")
+
+
 def _acceleration(system: Any) -> Any:
     return system.potential.acceleration
 
@@ -94,13 +112,13 @@ def _tilt(axis: int) -> Parameter:
 
 
 PARAMETERS: dict[str, Parameter] = {
-    "half_width": _leaf(lambda s: box_of(s).half_widths, 5e-4, "m", 1e-6),
+    "half_width": Parameter(lambda s: jnp.mean(box_of(s).half_widths), _half_width, 1e-6, np.inf, 5e-4, "m"),
     "corner_radius": _leaf(lambda s: box_of(s).corner_radius, 2e-3, "m"),
     "inertia": Parameter(lambda s: jnp.sum(_moments(s)) * 2 / 3, _inertia, 1e-9, np.inf, 6e-5, "kg m^2"),
     **{name: _center_of_mass(axis) for axis, name in enumerate(CENTER)},
     "gravity": Parameter(lambda s: jnp.linalg.norm(_acceleration(s)), _gravity, 0.0, np.inf, 0.1, "m/s^2"),
-    "friction": _leaf(lambda s: s.friction, 0.03, ""),
-    "restitution": _leaf(lambda s: s.restitution, 0.08, "", 0.0, 1.0),
+    "friction": _of_box(lambda s: s.friction, 0.03, np.inf),
+    "restitution": _of_box(lambda s: s.restitution, 0.08, 1.0),
     "friction_loss": _leaf(lambda s: _contact_model(s).friction_loss, 0.1, "", 0.0, 1.0),
     "restitution_loss": _leaf(lambda s: _contact_model(s).restitution_loss, 0.1, "", 0.0, 1.0),
     "loss_speed": _leaf(lambda s: _contact_model(s).loss_speed, 0.1, "m/s", 0.02, 5.0),

@@ -32,9 +32,9 @@ from carom.learning.run import RunFolder
 from carom.learning.toss_parameters import PARAMETERS, PLAIN, Quantity, limits, read_values, with_values
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Gravity
-from carom.simulation.impact import Stepper
+from carom.simulation.impact import ImpactRule, Stepper
 from carom.simulation.recording import Recording
-from carom.simulation.rollout import rollout
+from carom.simulation.rollout import Trajectory, rollout
 from carom.system import System
 
 ContactName = Literal["coulomb", "cm", "cmr", "lcp"]
@@ -46,8 +46,8 @@ class TossConfig:
     """How to learn from recorded tosses."""
 
     learn_of_toss: tuple[Quantity, ...] = PLAIN
-    """What is learned of a tossed body; all else is taken from the task. Gravity, table height and tilts absorb biases
-    of the recording."""
+    """What is learned of a tossed body; all else is taken from the task. half_width is the mean of a box's: it keeps
+    its proportions. Gravity, table height and tilts absorb biases of the recording."""
     toss_extras: tuple[Quantity, ...] = ()
     """What is learned besides: friction_loss and restitution_loss are what fast impacts lose of friction and
     restitution."""
@@ -142,17 +142,25 @@ COMPENSATION = 2.0
 """Samples in which a penetration is undone. A body at rest sinks by 3 mm with 8, by less than 1 mm with 2."""
 
 
+IMPACT: ImpactRule = "event"
+"""Contacts act when they close, which needs no small steps."""
+
+
 def toss_stepper(dt: float, substeps: int = 1) -> Stepper:
-    """How tosses are simulated: contacts act when they close, which needs no small steps."""
-    return Stepper(dt=jnp.asarray(dt / substeps), impact="event", compensation_steps=COMPENSATION * substeps)
+    """How tosses are simulated."""
+    return Stepper(dt=jnp.asarray(dt / substeps), impact=IMPACT, compensation_steps=COMPENSATION * substeps)
+
+
+def _motion(system: System, x, v, stepper: Stepper, samples: int, substeps: int) -> Trajectory:
+    """Motion of the body from recorded points and velocities, at every step."""
+    return rollout(system, body_points(system, x), body_points(system, v), stepper, samples * substeps)
 
 
 def _predict(system: System, x0, v0, stepper: Stepper, samples: int, substeps: int):
     """Recorded points at the samples, from recorded points and velocities."""
 
     def one(x, v):
-        motion = rollout(system, body_points(system, x), body_points(system, v), stepper, samples * substeps)
-        return box_points(system, motion.x[::substeps])
+        return box_points(system, _motion(system, x, v, stepper, samples, substeps).x[::substeps])
 
     return jax.vmap(one)(x0, v0)
 
@@ -189,12 +197,33 @@ def _segment_batch(system, names, values, x0, v0, end, stepper, samples, substep
     return out, columns
 
 
-def predict_tosses(system: System, recording: Recording, *, samples: int | None = None, substeps: int = 1):
-    """Points (N, T, 4, 3) of all tosses from their first recorded states, `samples` steps (all by default)."""
-    samples = recording.x.shape[1] - 1 if samples is None else min(samples, recording.x.shape[1] - 1)
+@eqx.filter_jit
+def _motions(system: System, x0, v0, stepper: Stepper, samples: int, substeps: int) -> Trajectory:
+    def one(x, v):
+        motion = _motion(system, x, v, stepper, samples, substeps)
+        contact = motion.contact[1:].reshape(samples, substeps).any(axis=1)
+        at_samples = jax.tree.map(lambda part: part[::substeps], motion)
+        return dataclasses.replace(at_samples, contact=jnp.concatenate([motion.contact[:1], contact]))
+
+    out = jax.vmap(one)(x0, v0)
+    return dataclasses.replace(out, time=out.time[0])
+
+
+def toss_motions(system: System, recording: Recording, *, samples: int | None = None, substeps: int = 1) -> Trajectory:
+    """Motion (N, T, 4, 3) of the body in all tosses from their first recorded states, `samples` steps (all by default).
+
+    Its points are the body's own, from the centre of mass on; those of recordings are from the middle of its box.
+    """
+    most = recording.x.shape[1] - 1
+    count = most if samples is None else min(samples, most)
     stepper = toss_stepper(recording.dt, substeps)
     x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
-    return np.asarray(_tosses(system.with_max_active(4), (), jnp.zeros(0), x0, v0, stepper, samples, substeps))
+    return _motions(system.with_max_active(4), x0, v0, stepper, count, substeps)
+
+
+def predict_tosses(system: System, recording: Recording, *, samples: int | None = None, substeps: int = 1):
+    """The same, as points that are recorded."""
+    return np.asarray(box_points(system, toss_motions(system, recording, samples=samples, substeps=substeps).x))
 
 
 # --- segments -----------------------------------------------------------------------------------------------------

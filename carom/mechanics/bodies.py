@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, not_negative, positive, require, require_values
 
 
 class Body(eqx.Module):
@@ -48,8 +48,8 @@ class PointMass(Body):
     def __init__(self, mass, radius=0.0):
         self.mass, self.radius = as_floats(mass), as_floats(radius)
         _check_shapes(self.mass, self.radius)
-        require_values("mass", mass, self.mass > 0, "a positive number of kilograms")
-        require_values("radius", radius, self.radius >= 0, "zero or a positive number of metres")
+        require_values("mass", mass, positive, "a positive number of kilograms")
+        require_values("radius", radius, not_negative, "zero or a positive number of metres")
 
     def n_points(self, dim: int) -> int:
         return 1
@@ -82,9 +82,9 @@ class RigidBody(Body):
             self.moments.shape in ((2,), (3,)),
             f"moments must be 2 or 3 second moments, one an axis; their shape was {self.moments.shape}.",
         )
-        require_values("mass", mass, self.mass > 0, "a positive number of kilograms")
-        require_values("moments", moments, self.moments > 0, "positive second moments in kg m^2, one an axis")
-        require_values("radius", radius, self.radius >= 0, "zero or a positive number of metres")
+        require_values("mass", mass, positive, "a positive number of kilograms")
+        require_values("moments", moments, positive, "positive second moments in kg m^2, one an axis")
+        require_values("radius", radius, not_negative, "zero or a positive number of metres")
 
     def n_points(self, dim: int) -> int:
         return dim + 1

@@ -4,9 +4,10 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, at_once_if_known, positive, require, require_values, whole
 
 
 class Constraint(eqx.Module):
@@ -20,6 +21,13 @@ class Constraint(eqx.Module):
     def points(self) -> tuple[int, ...]:
         """The points it refers to."""
 
+    def size(self, length: Float[Array, ""]) -> Float[Array, "*e"]:
+        """How large `Phi` is beside what it holds, of all equations or of each: of a rod, the square of its length.
+
+        `length` (m): size of the bodies, for what has none of its own. Here for a `Phi` in m^2.
+        """
+        return length**2
+
 
 class Distance(Constraint):
     """A massless rod: points `i` and `j` keep the distance `length` (m). `|x_i - x_j|^2 - length^2 = 0`."""
@@ -29,12 +37,15 @@ class Distance(Constraint):
     length: Float[Array, ""]
 
     def __init__(self, i: int, j: int, length):
+        self.i, self.j, self.length = whole("Distance i", i), whole("Distance j", j), as_floats(length)
         require(i != j, f"Distance joins two different points; both were {i}.")
-        self.i, self.j, self.length = i, j, as_floats(length)
-        require_values("length", length, self.length > 0, "a positive number of metres")
+        require_values("length", length, positive, "a positive number of metres")
 
     def __call__(self, x):
         return (jnp.sum((x[self.i] - x[self.j]) ** 2) - self.length**2)[None]
+
+    def size(self, length):
+        return self.length**2
 
     def points(self):
         return self.i, self.j
@@ -48,11 +59,15 @@ class Tether(Constraint):
     length: Float[Array, ""]
 
     def __init__(self, i: int, anchor, length):
-        self.i, self.anchor, self.length = i, as_floats(anchor), as_floats(length)
-        require_values("length", length, self.length > 0, "a positive number of metres (for 0 use Joint)")
+        self.i, self.anchor, self.length = whole("Tether i", i), as_floats(anchor), as_floats(length)
+        require_values("Tether anchor", anchor, np.isfinite, "finite coordinates in m")
+        require_values("length", length, positive, "a positive number of metres (for 0 use Joint)")
 
     def __call__(self, x):
         return (jnp.sum((x[self.i] - self.anchor) ** 2) - self.length**2)[None]
+
+    def size(self, length):
+        return self.length**2
 
     def points(self):
         return (self.i,)
@@ -70,12 +85,16 @@ class Joint(Constraint):
     anchor: Float[Array, " d"]
 
     def __init__(self, first: int, weights, anchor):
-        self.first, self.weights, self.anchor = first, as_floats(weights), as_floats(anchor)
-        require_values("weights", weights, jnp.abs(jnp.sum(self.weights) - 1) < 1e-6, "numbers that sum to 1")
+        self.first, self.weights, self.anchor = whole("Joint first", first), as_floats(weights), as_floats(anchor)
+        require_values("Joint anchor", anchor, np.isfinite, "finite coordinates in m")
+        require_values("weights", weights, _sums_to_one, "numbers that sum to 1")
 
     def __call__(self, x):
         points = x[self.first : self.first + self.weights.shape[0]]
         return self.weights @ points - self.anchor
+
+    def size(self, length):
+        return jnp.maximum(length, _arm(self.weights))
 
     def points(self):
         return tuple(range(self.first, self.first + self.weights.shape[0]))
@@ -95,12 +114,16 @@ class Pivot(Constraint):
 
     def __init__(self, i: int, weights_i, j: int, weights_j):
         require(i != j, f"Pivot joins two different bodies; the first point of both was {i}.")
-        self.i, self.j, self.weights_i, self.weights_j = i, j, as_floats(weights_i), as_floats(weights_j)
+        self.i, self.j = whole("Pivot i", i), whole("Pivot j", j)
+        self.weights_i, self.weights_j = as_floats(weights_i), as_floats(weights_j)
         for name, weights in (("weights_i", self.weights_i), ("weights_j", self.weights_j)):
-            require_values(name, weights, jnp.abs(jnp.sum(weights) - 1) < 1e-6, "numbers that sum to 1")
+            require_values(name, weights, _sums_to_one, "numbers that sum to 1")
 
     def __call__(self, x):
         return _material(x, self.i, self.weights_i) - _material(x, self.j, self.weights_j)
+
+    def size(self, length):
+        return jnp.maximum(length, jnp.maximum(_arm(self.weights_i), _arm(self.weights_j)))
 
     def points(self):
         return (*_range(self.i, self.weights_i), *_range(self.j, self.weights_j))
@@ -128,7 +151,7 @@ class Angles(Constraint):
 
     def __init__(self, i: int, directions, others, cosines=0.0, j: int | None = None):
         require(i != j, f"Angles are between two different bodies; the first point of both was {i}.")
-        self.i, self.j = i, j
+        self.i, self.j = whole("Angles i", i), None if j is None else whole("Angles j", j)
         self.directions, self.others = as_floats(directions), as_floats(others)
         shape = self.directions.shape
         require(
@@ -136,18 +159,24 @@ class Angles(Constraint):
             f"Angles directions and others must be as many vectors (e, d); their shapes were {shape} and "
             f"{self.others.shape}.",
         )
+        for name, value in (("directions", directions), ("others", others)):
+            require_values(f"Angles {name}", value, np.isfinite, "finite numbers")
         cosines = as_floats(cosines)
         require(
             cosines.shape in ((), shape[:1]),
             f"Angles cosines must be one number or {shape[0]}; their shape was {cosines.shape}.",
         )
-        self.cosines = jnp.broadcast_to(cosines, shape[:1])
-        require_values("cosines", cosines, jnp.abs(self.cosines) < 1, "between -1 and 1, without these")
+        with at_once_if_known(cosines):
+            self.cosines = jnp.broadcast_to(cosines, shape[:1])
+        require_values("cosines", cosines, lambda c: np.abs(c) < 1, "between -1 and 1, without these")
 
     def __call__(self, x):
         turned = self.directions @ _axes(x, self.i, self.directions.shape[1])
         others = self.others if self.j is None else self.others @ _axes(x, self.j, self.others.shape[1])
         return jnp.sum(turned * others, axis=1) - self.cosines
+
+    def size(self, length):
+        return jnp.ones_like(length)
 
     def points(self):
         d = self.directions.shape[1]
@@ -173,9 +202,11 @@ class Track(Constraint):
 
     def __init__(self, i: int, weights, normals, anchor, j: int | None = None):
         require(i != j, f"Track joins two different bodies; the first point of both was {i}.")
-        self.i, self.j = i, j
+        self.i, self.j = whole("Track i", i), None if j is None else whole("Track j", j)
         self.weights, self.normals, self.anchor = as_floats(weights), as_floats(normals), as_floats(anchor)
-        require_values("weights", weights, jnp.abs(jnp.sum(self.weights) - 1) < 1e-6, "numbers that sum to 1")
+        for name, value in (("normals", normals), ("anchor", anchor)):
+            require_values(f"Track {name}", value, np.isfinite, "finite numbers")
+        require_values("weights", weights, _sums_to_one, "numbers that sum to 1")
         require(
             self.normals.ndim == 2 and self.normals.shape[1:] == self.anchor.shape,
             f"Track normals must be vectors (e, d) and anchor a point (d,); their shapes were {self.normals.shape} and "
@@ -189,6 +220,9 @@ class Track(Constraint):
         axes = _axes(x, self.j, self.anchor.shape[0])
         return self.normals @ axes @ (place - x[self.j] - self.anchor @ axes)
 
+    def size(self, length):
+        return jnp.maximum(length, _arm(self.weights))
+
     def points(self):
         frame = () if self.j is None else range(self.j, self.j + self.anchor.shape[0] + 1)
         return (*_range(self.i, self.weights), *frame)
@@ -197,7 +231,17 @@ class Track(Constraint):
 def place_weights(place) -> Float[Array, " p"]:
     """Weights over a rigid body's points of the material point at `place` (d,) in the frame of its axes (m)."""
     place = as_floats(place)
-    return jnp.concatenate([1 - jnp.sum(place, keepdims=True), place])
+    with at_once_if_known(place):
+        return jnp.concatenate([1 - jnp.sum(place, keepdims=True), place])
+
+
+def _sums_to_one(weights: np.ndarray) -> bool:
+    return bool(abs(np.sum(weights) - 1) < 1e-6)
+
+
+def _arm(weights: Float[Array, " p"]) -> Float[Array, ""]:
+    """How far a material point is from its body's centre of mass (m)."""
+    return jnp.linalg.norm(weights[1:])
 
 
 def _range(first: int, weights: Float[Array, " p"]) -> range:
@@ -223,6 +267,9 @@ class Rigid(Constraint):
         axes = x[self.first + 1 : self.first + 1 + self.dim] - x[self.first]
         rows, columns = jnp.triu_indices(self.dim)
         return (axes @ axes.T - jnp.eye(self.dim, dtype=x.dtype))[rows, columns]
+
+    def size(self, length):
+        return jnp.ones_like(length)
 
     def points(self):
         return tuple(range(self.first, self.first + self.dim + 1))

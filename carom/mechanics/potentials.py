@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from carom.checks import as_floats, require, require_values
+from carom.checks import as_floats, not_negative, require, require_values, whole_numbers
 
 
 class Potential(eqx.Module):
@@ -57,15 +58,15 @@ class Springs(Potential):
     anchor: Float[Array, " d"] | None
 
     def __init__(self, points: Sequence[int], stiffness, rest_length, anchor=None):
-        self.points = tuple(int(p) for p in points)
+        self.points = whole_numbers("Springs points", points)
         self.stiffness, self.rest_length = as_floats(stiffness), as_floats(rest_length)
         self.anchor = None if anchor is None else as_floats(anchor)
         require(
             len(self.points) + (anchor is not None) >= 2,
             f"points must name at least two ends of springs, the anchor included; they were {self.points}.",
         )
-        require_values("stiffness", stiffness, self.stiffness >= 0, "zero or a positive number of J/m^2")
-        require_values("rest_length", rest_length, self.rest_length >= 0, "zero or a positive number of metres")
+        require_values("stiffness", stiffness, not_negative, "zero or a positive number of J/m^2")
+        require_values("rest_length", rest_length, not_negative, "zero or a positive number of metres")
 
     def __call__(self, x, mass_matrix):
         row = x[jnp.array(self.points)]
@@ -89,6 +90,7 @@ class Gravity(Potential):
             self.acceleration.ndim == 1 and self.acceleration.shape[0] in (2, 3),
             f"acceleration must be a vector of 2 or 3 numbers in m/s^2; its shape was {self.acceleration.shape}.",
         )
+        require_values("acceleration", acceleration, np.isfinite, "finite numbers in m/s^2")
 
     def __call__(self, x, mass_matrix):
         # A row of the mass matrix sums to its body's mass at the centre of mass and to zero at the axis points.

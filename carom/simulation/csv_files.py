@@ -19,11 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from carom.errors import CaromError
+from carom.simulation.clock import Clock, Irregular, clock_of, digit_of, digits_of, rounding_of
 
 COORDINATE = re.compile(r"(v?)([xyz])(\d+)")
+WITH_UNIT = re.compile(r"(?P<name>t|time|v?[xyz]\d+)\s*([\[({].*|[/_,]\s*\S.*|in\s.*)")
+SHORTEST_DIGIT = 1e-9
+"""Times with more decimals (s) are floats as they are."""
 DIFFERENCES = "velocities by differences of positions"
 """What `source` says where they are."""
 
@@ -34,6 +38,7 @@ def read_csv(path: Path) -> dict[str, Any]:
     **Raises:** `CaromError` naming line and column, what was there, and what to do; `OSError` if it cannot be read.
     """
     rows, names = _rows(path)
+    _check_names(names)
     columns = {name: k for k, name in enumerate(names)}
     clock = next((name for name in ("time", "t") if name in columns), None)
     if clock is None:
@@ -47,8 +52,10 @@ def read_csv(path: Path) -> dict[str, Any]:
     if has_velocity:
         wanted += [f"v{axis}{p}" for p in range(points) for axis in "xyz"[:dim]]
     wanted += ["contact"] if "contact" in columns else []
+    _check_first(rows[0], [columns[name] for name in wanted])
     table = np.array([[_number(row[columns[name]], name, line) for name in wanted] for line, row in rows])
-    groups = _trajectories(labels, [line for line, _ in rows])
+    lines = [line for line, _ in rows]
+    groups = _trajectories(labels, lines)
     most = max(len(group) for group in groups)
 
     def padded(part: Float[np.ndarray, "S c"]) -> np.ndarray:
@@ -57,17 +64,22 @@ def read_csv(path: Path) -> dict[str, Any]:
 
     count = points * dim
     x = padded(table[:, 1 : 1 + count]).reshape(len(groups), most, points, dim)
-    time = np.stack([_clock(table[group, 0], most) for group in groups])
-    out: dict[str, Any] = {"x": x, "time": time, "length": np.array([len(group) for group in groups])}
+    length = np.array([len(group) for group in groups])
+    digits = digits_of([row[columns[clock]] for _, row in rows])
+    time = padded(np.stack([table[:, 0], digits], axis=1))
+    found = _equal_steps(time[..., 0], time[..., 1], length)
+    if isinstance(found, Irregular):
+        first = groups[found.trajectory][found.sample]
+        raise CaromError(_unequal(found, clock, lines[first : first + 2], table[first : first + 2, 0]))
+    out: dict[str, Any] = {"x": x, "time": found.time, "dt": found.step, "length": length}
     if has_velocity:
         out["v"] = padded(table[:, 1 + count : 1 + 2 * count]).reshape(x.shape)
     else:
-        if min(map(len, groups)) < 3:
+        if length.min() < 3:
             raise CaromError("trajectories without velocities must have at least 3 samples; one had fewer.")
         out["v"] = np.zeros_like(x)
-        for k, group in enumerate(groups):
-            n = len(group)
-            out["v"][k, :n] = np.gradient(x[k, :n], time[k, :n], axis=0, edge_order=2)
+        for k, n in enumerate(length):
+            out["v"][k, :n] = np.gradient(x[k, :n], found.step, axis=0, edge_order=2)
         out["source"] = DIFFERENCES
     if "contact" in columns:
         out["contact"] = _flags(padded(table[:, -1:])[..., 0])
@@ -96,8 +108,30 @@ def _rows(path: Path) -> tuple[list[tuple[int, list[str]]], list[str]]:
     rows = [(number, row) for (number, _), row in zip(lines[1:], parsed[1:], strict=True)]
     for number, row in rows:
         if len(row) != len(names):
-            raise CaromError(f"line {number} must have {len(names)} values, as the header; it had {len(row)}.")
+            more = len(row) > len(names) and delimiter == ","
+            advice = "if decimals have commas, write points" if more else "add or remove separators"
+            raise CaromError(
+                f"line {number} must have {len(names)} values, as the header; it had {len(row)}: {advice}."
+            )
     return rows, names
+
+
+def _check_names(names: list[str]) -> None:
+    """Raise `CaromError` for names of columns that only need to be written in another way."""
+    for k, name in enumerate(names, 1):
+        if not name:
+            raise CaromError(
+                f"column {k} of the header has no name: name it, or leave it out (a separator at line ends?)."
+            )
+        unit = WITH_UNIT.fullmatch(name)
+        if unit:
+            bare = unit["name"]
+            wanted = "s" if bare in ("t", "time") else "m/s" if bare[0] == "v" else "m"
+            raise CaromError(
+                f"the header has a column {name!r}: call it {bare}, without a unit; its values must be in {wanted}."
+            )
+        if re.fullmatch("v?[xyz]", name):
+            raise CaromError(f"the header has a column {name!r}: call it {name}0, points are numbered from 0.")
 
 
 def _layout(names: list[str]) -> tuple[int, int, bool]:
@@ -118,21 +152,42 @@ def _layout(names: list[str]) -> tuple[int, int, bool]:
     missing = sorted(every - positions, key=lambda c: (c[1], c[0]))
     if not points or missing:
         name = "x0" if not points else "".join(map(str, missing[0]))
-        raise CaromError(f"the header must have a column {name} (m); it had {', '.join(names)}.")
+        advice = " Points are numbered from 0." if points and min(p for _, p in positions) > 0 else ""
+        raise CaromError(f"the header must have a column {name} (m); it had {', '.join(names)}.{advice}")
     if velocities and velocities != every:
         axis, p = sorted(every ^ velocities, key=lambda c: (c[1], c[0]))[0]
         raise CaromError(f"velocities must be there for all coordinates or for none; look at v{axis}{p}.")
     return points, dim, bool(velocities)
 
 
+def _check_first(row: tuple[int, list[str]], wanted: list[int]) -> None:
+    """Raise `CaromError` if the row below the header holds words, such as units."""
+    line, cells = row
+    if all(cells[k].strip() and not re.search(r"\d|nan|inf", cells[k].lower()) for k in wanted):
+        shown = ", ".join(cells[k].strip() for k in wanted)[:40]
+        raise CaromError(f"line {line} holds no numbers ({shown}): leave it out; units are s, m and m/s.")
+
+
 def _number(text: str, name: str, line: int) -> float:
+    text = text.strip()
     try:
         value = float(text)
     except ValueError:
         value = np.nan
-    if not np.isfinite(value):
-        raise CaromError(f"line {line}, column {name} must be a number; it was {text.strip()[:40]!r}.")
-    return value
+    if np.isfinite(value):
+        return value
+    where, gap = (
+        f"line {line}, column {name}",
+        "fill it in, or leave the row out and give those after it another number in a column trajectory",
+    )
+    if not text:
+        raise CaromError(f"{where} is empty: {gap}.")
+    if re.fullmatch(r"[+-]?[\d.]*,\d+(e[+-]?\d+)?", text.lower()):
+        raise CaromError(
+            f"{where} must be a number with a decimal point; it was {text[:40]!r}: replace decimal commas by points."
+        )
+    advice = f": {gap}" if text.lower() in ("nan", "na", "n/a", "null", "none", "-") else ""
+    raise CaromError(f"{where} must be a number; it was {text[:40]!r}{advice}.")
 
 
 def _trajectories(labels: list[str], lines: list[int]) -> list[list[int]]:
@@ -151,10 +206,39 @@ def _trajectories(labels: list[str], lines: list[int]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _clock(time: Float[np.ndarray, " S"], most: int) -> Float[np.ndarray, " T"]:
-    """Times of a trajectory, going on in equal steps where it is shorter than the longest."""
-    step = (time[-1] - time[0]) / (len(time) - 1)
-    return np.concatenate([time, time[-1] + step * np.arange(1, most - len(time) + 1)])
+def _equal_steps(
+    time: Float[np.ndarray, "N T"], digit: Float[np.ndarray, "N T"], length: Int[np.ndarray, " N"]
+) -> Clock | Irregular:
+    """The clock of the times of all trajectories, whose last digits are worth `digit`."""
+    valid = np.arange(time.shape[1]) < length[:, None]
+    if digit.min() < SHORTEST_DIGIT:  # all that a float had was printed, which may be less
+        digit = np.maximum(digit, digit_of(time, valid))
+    return clock_of(time, valid, digit=digit, rounding=2 * rounding_of(time, float(np.abs(time[valid]).max())))
+
+
+def _unequal(found: Irregular, clock: str, lines: list[int], times: Float[np.ndarray, " 2"]) -> str:
+    """What is wrong between two rows, of these lines and times, and what to do."""
+    where, apart = (
+        f"line {lines[1]}, column {clock}",
+        "give the rows from there on another number in a column trajectory",
+    )
+    if found.coarse:
+        apart = "write times with more decimals"
+    if found.back:
+        before = f"it was {times[1]:.15g}, after {times[0]:.15g} in line {lines[0]}"
+        advice = "leave out one of the two rows" if found.step == 0 else "put the rows in the order of time"
+        return f"{where} must increase; {before}: {advice}, or {apart}."
+    lost = round(found.step / found.typical) - 1
+    near = abs(found.step - (lost + 1) * found.typical) <= max(0.01 * found.typical, 2 * found.digit)
+    # A step that differs from the first one on is another rate.
+    gap = lost > 0 and found.sample > 0 and near and not found.coarse
+    advice = (
+        f"{lost} of the samples {'is' if lost == 1 else 'are'} missing there: fill in, or" if gap else "resample, or"
+    )
+    return (
+        f"{where} must have equal steps; it was {found.step:.9g} s after line {lines[0]}, most are "
+        f"{found.typical:.9g} s apart; {advice} {apart}."
+    )
 
 
 def _flags(values: np.ndarray) -> np.ndarray:

@@ -12,93 +12,15 @@ after they have opened, and those that close after the last event that a step ma
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.contact.batching import anywhere
 from carom.contact.impulses import ContactState, Jump
-from carom.simulation.impact import Stepper, StepResult, after_impact, contact_jump, impact_at
 from carom.system import System
 
 State = tuple[Float[Array, "n d"], Float[Array, "n d"]]
-
-
-class _Progress(NamedTuple):
-    """How far a step has come."""
-
-    x: Float[Array, "n d"]
-    v: Float[Array, "n d"]
-    left: Float[Array, ""]  # s until its end
-    end: State  # where the motion leads by then, if nothing closes
-    acted: Bool[Array, " C"]  # contacts that have acted at this state
-    over: Bool[Array, ""]  # there is no other event
-    contact: Bool[Array, ""]
-    overflow: Int[Array, ""]
-    residual: Float[Array, ""]
-
-
-def step_with_events(
-    system: System,
-    x: Float[Array, "n d"],
-    v: Float[Array, "n d"],
-    inverse_mass: Float[Array, "n n"],
-    stepper: Stepper,
-    motion: tuple[Callable, Callable],
-) -> StepResult:
-    """One step, cut at up to `stepper.events` times at which contacts close; `motion` is that of `smooth_flow`."""
-    _, after = motion
-    end = after((x, v), stepper.dt)
-    # Nothing in the search is differentiated, the system's own geometry included.
-    still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
-
-    def part(now: _Progress, _):
-        start, ends, left = jax.lax.stop_gradient(((now.x, now.v), now.end, now.left))
-        event = next_event(still, start, ends, jnp.where(now.over, 0, left), now.acted)
-
-        def go_on():
-            state, time, closed, happens = to_event((now.x, now.v), left, event, system, motion)
-            contacts, jump = contact_jump(system, *state, inverse_mass, stepper, closed)
-            out = after_impact(contacts, jump)
-            x = out.x - own_times(contacts, jump, stepper.dt)
-            rest = jnp.where(happens, now.left - time, 0)
-            new = _Progress(
-                x=x,
-                v=out.v,
-                left=rest,
-                end=after((x, out.v), rest),
-                acted=closed,
-                over=~happens,
-                contact=now.contact | out.contact,
-                overflow=jnp.maximum(now.overflow, out.overflow),
-                residual=jnp.maximum(now.residual, out.residual),
-            )
-            return jax.tree.map(lambda a, b: jnp.where(happens, a, b), new, now._replace(over=jnp.asarray(True)))
-
-        return jax.lax.cond(anywhere(event.happens), go_on, lambda: now._replace(over=jnp.asarray(True))), None
-
-    def with_contact():
-        none = jnp.zeros(system.n_candidates, bool)
-        no, zero = jnp.asarray(False), jnp.zeros((), x.dtype)
-        start = _Progress(x, v, stepper.dt, end, none, no, no, jnp.asarray(0), zero)
-        progress, _ = jax.lax.scan(part, start, length=stepper.events)
-        out = impact_at(system, *progress.end, inverse_mass, stepper)
-        return StepResult(
-            out.x,
-            out.v,
-            contact=progress.contact | out.contact,
-            overflow=jnp.maximum(progress.overflow, out.overflow),
-            residual=jnp.maximum(progress.residual, out.residual),
-        )
-
-    def alone():
-        return StepResult(end[0], end[1], jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
-
-    start, ends = jax.lax.stop_gradient(((x, v), end))
-    near = may_close(still, start, ends, stepper.dt)
-    return jax.lax.cond(anywhere(near), with_contact, alone)
 
 
 # The time of the event is found without derivatives, on an interpolant of the step. One Newton step at the state there,
@@ -136,10 +58,12 @@ def to_event(
     x, v = x + late * v + late**2 / 2 * acceleration, v + late * acceleration
     gaps = jax.lax.stop_gradient(system.gaps(x))
     this = jnp.arange(gaps.shape[0]) == event.candidate
-    return (x, v), event.time + late, happens & (this | (gaps <= touching(gaps.dtype))), happens
+    return (x, v), event.time + late, happens & (this | (gaps <= touching(system, x))), happens
 
 
-def own_times(contacts: ContactState, jump: Jump, dt: Float[Array, ""]) -> Float[Array, "n d"]:
+def own_times(
+    contacts: ContactState, jump: Jump, dt: Float[Array, ""], near: Float[Array, " C"]
+) -> Float[Array, "n d"]:
     """What the positions lose because contacts that close together do so each at its own time (m).
 
     As good as zero, but for its derivative: contact k acts `gap_k / speed_k` before the event, or after. To first
@@ -147,7 +71,7 @@ def own_times(contacts: ContactState, jump: Jump, dt: Float[Array, ""]) -> Float
     """
     if jump.impulse is None:
         return jnp.zeros_like(contacts.x)
-    active, near = contacts.active, touching(contacts.x.dtype)
+    active, near = contacts.active, near[contacts.active.candidate]
     speed = jax.lax.stop_gradient(contacts.velocity[:, 0])
     closing = active.active & (active.gap > -near) & (_REOPENING * dt * speed < -near)
     late = jnp.where(closing, -active.gap / jnp.where(closing, speed, 1), 0)
@@ -157,29 +81,42 @@ def own_times(contacts: ContactState, jump: Jump, dt: Float[Array, ""]) -> Float
     return jnp.einsum("k,kid->id", late, kicks)
 
 
-def touching(dtype) -> float:
-    """Contacts nearer than this (m) touch: a gap of zero is known to rounding only."""
-    return 0.1 * float(jnp.finfo(dtype).eps) ** 0.5
+def touching(system: System, x: Float[Array, "n d"]) -> Float[Array, " C"]:
+    """Contacts nearer than this (m or rad) touch: a gap of zero is known to rounding only.
+
+    In double precision 1.5e-8 of what meets: of a radius, or of how far a gap changes smoothly.
+    """
+    x = jax.lax.stop_gradient(x)
+    own = jnp.minimum(system.reach(), system.travel())
+    own = jnp.where((own > 0) & jnp.isfinite(own), own, system.size(x))
+    return jnp.maximum(jnp.finfo(x.dtype).eps ** 0.5 * own, rounding(system, x)).astype(x.dtype)
+
+
+def rounding(system: System, x: Float[Array, "n d"]) -> Float[Array, " C"]:
+    """What is rounding in gaps (m or rad)."""
+    candidates = system.candidates(x)
+    sizes = jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * jnp.linalg.norm(x, axis=-1)[candidates.stencil]
+    return 8 * jnp.finfo(x.dtype).eps * jnp.sum(sizes, axis=1)
 
 
 # --- Where is the next event? -----------------------------------------------------------------------------------
 #
 # Positions are a cubic in time, from both ends of the interval with their velocities. It is gone along in pieces in
-# which nothing moves far beside the size of the bodies, so that none passes through another unseen; mostly there is
-# one. In a piece each gap is a cubic in time again. Where one goes below zero, so must the gap itself, or the piece
-# ends there and the next is begun. The first root is refined on the interpolant.
+# which no gap can close and open again unseen: nothing moves far beside the size of the bodies, or not half as far as
+# it is away; mostly there is one. In a piece each gap is a cubic in time again. Where one goes below zero, so must the
+# gap itself, or the piece ends there and the next is begun. The first root is refined on the interpolant.
 
 _REOPENING = 1e-3
 """Share of the interval in which a contact that touches at its start must open, or it is taken to rest."""
-_SHORTEST = 0.02
-"""Shortest piece, as a share of the interval."""
-_MOST_PIECES = 200
+_MOST_PIECES = 500
+"""Bodies that go on side by side take one for each half of their size; if that is not enough, the step is not right."""
 
 
 class Event(NamedTuple):
     happens: Bool[Array, ""]
     time: Float[Array, ""]  # s from the start of the interval; 0 without an event
     candidate: Int[Array, ""]
+    unsure: Bool[Array, ""]  # the interval was too long to look at all of it
 
 
 class _Search(NamedTuple):
@@ -194,6 +131,7 @@ class _Search(NamedTuple):
     guess: Float[Array, ""]
     candidate: Int[Array, ""]
     pieces: Int[Array, ""]
+    unsure: Bool[Array, ""]
 
 
 def next_event(system: System, start: State, end: State, time: Float[Array, ""], acted: Bool[Array, " C"]) -> Event:
@@ -208,9 +146,9 @@ def next_event(system: System, start: State, end: State, time: Float[Array, ""],
         return jax.jvp(system.gaps, (where,), (velocity,))
 
     gap, speed = gaps_at(jnp.zeros_like(time))
-    longest = longest_piece(system, start, end, time, gap)
-    nothing, near = jnp.zeros_like(time), touching(gap.dtype)
-    clear = jnp.maximum(1e-3 * near, 8 * jnp.finfo(gap.dtype).eps * jnp.max(jnp.abs(start[0])))
+    fastest, travel = closing_speed(system, start, end), system.travel()
+    nothing, near = jnp.zeros_like(time), touching(system, start[0])
+    clear = jnp.maximum(1e-3 * near, rounding(system, start[0]))
     # The first piece is a short one: what touches at the start is open if it is by then, or if it closes at speed.
     closes = (gap > -near) & (_REOPENING * time * speed < -near)
     first = _Search(
@@ -223,15 +161,19 @@ def next_event(system: System, start: State, end: State, time: Float[Array, ""],
         guess=nothing,
         candidate=jnp.asarray(0),
         pieces=jnp.asarray(0),
+        unsure=jnp.asarray(False),
     )
 
     def keep_going(search: _Search):
         return ~search.found & (search.end < time) & (search.pieces < _MOST_PIECES)
 
     def body(search: _Search) -> _Search:
-        length = jnp.where(search.pieces == 0, _REOPENING * time, longest)
+        longest = longest_piece(search.gap, fastest, travel, time - search.end)
+        length = jnp.where(search.pieces == 0, jnp.minimum(_REOPENING * time, longest), longest)
         whole = jnp.minimum(search.end + length, time)
-        whole = jnp.where(search.pieces == _MOST_PIECES - 1, time, whole)
+        last = search.pieces == _MOST_PIECES - 1
+        unsure = last & (whole < time)
+        whole = jnp.where(last, time, whole)
         length = whole - search.end
         gap, speed = gaps_at(whole)
         share, most = first_root(search.gap, length * search.speed, gap, length * speed)
@@ -251,24 +193,29 @@ def next_event(system: System, start: State, end: State, time: Float[Array, ""],
             guess=search.end + length * jnp.where(root, share[which], 0),
             candidate=which,
             pieces=search.pieces + 1,
+            unsure=unsure,
         )
 
     search = jax.lax.while_loop(keep_going, body, first)
 
-    def gap_of(t, _):
-        where, _ = hermite(start, end, total, t)
-        return jnp.where(search.found, system.gaps(where)[search.candidate], t - search.guess)
+    # In shares of the interval, and gaps such that the tolerance is a hundredth of what touches.
+    guess, tolerance = search.guess / total, 1e-3 * float(jnp.finfo(gap.dtype).eps) ** 0.5
+    unit = near[search.candidate] / (100 * tolerance)
+
+    def gap_of(share, _):
+        where, _ = hermite(start, end, total, share * total)
+        return jnp.where(search.found, system.gaps(where)[search.candidate] / unit, share - guess)
 
     refined = optx.root_find(
         gap_of,
-        optx.Newton(rtol=1e-9, atol=0.01 * near),
-        search.guess,
-        options={"lower": search.lower, "upper": search.end},
+        optx.Newton(rtol=1e-9, atol=tolerance),
+        guess,
+        options={"lower": search.lower / total, "upper": search.end / total},
         max_steps=8,
         throw=False,
     ).value
-    refined = jnp.where(jnp.isfinite(refined), refined, search.guess)
-    return Event(search.found, jnp.where(search.found, refined, 0), search.candidate)
+    refined = jnp.where(jnp.isfinite(refined), refined * total, search.guess)
+    return Event(search.found, jnp.where(search.found, refined, 0), search.candidate, search.unsure)
 
 
 def hermite(start: State, end: State, time: Float[Array, ""], t: Float[Array, ""]) -> State:
@@ -294,17 +241,19 @@ def may_close(system: System, start: State, end: State, time: Float[Array, ""]) 
     """
     fastest = closing_speed(system, start, end)
     nearest = jnp.minimum(system.gaps(start[0]), system.gaps(end[0]))
-    return jnp.any(nearest <= 2 * fastest * time + touching(nearest.dtype))
+    return jnp.any(nearest <= 2 * fastest * time + touching(system, start[0]))
 
 
 def longest_piece(
-    system: System, start: State, end: State, time: Float[Array, ""], gap: Float[Array, " C"]
+    gap: Float[Array, " C"], fastest: Float[Array, " C"], travel: Float[Array, " C"], left: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """A time (s) in which no body moves far beside the way through what it could meet."""
-    fastest = closing_speed(system, start, end)
-    matters = (fastest > 0) & (gap <= fastest * time)
-    allowed = jnp.where(matters, system.travel() / jnp.where(fastest > 0, fastest, 1), jnp.inf)
-    return jnp.maximum(jnp.min(allowed, initial=jnp.inf), _SHORTEST * time)
+    """A time (s) in which no gap closes and opens again: see the head of this part.
+
+    `fastest`, how fast gaps change; `travel`, how far they may, see `Contact.travel`; `left` (s), of the interval.
+    """
+    matters = (fastest > 0) & (gap <= 2 * fastest * left) & (travel > 0)
+    allowed = jnp.maximum(travel, gap / 2) / jnp.where(fastest > 0, fastest, 1)
+    return jnp.min(jnp.where(matters, allowed, jnp.inf), initial=jnp.inf)
 
 
 def first_root(

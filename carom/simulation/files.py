@@ -57,7 +57,7 @@ def load_recording(path: str | os.PathLike[str], *, task: str | None = None) -> 
         )
         recording = Recording.of(**content)
         wanted = f"be {task!r}"
-        advice = "this is a file of another task: choose another file or name its own task"
+        advice = "this is a file of another task: choose another file, name its own task, or take task out of it"
         require_part(task is None or recording.task in ("", task), "task", wanted, recording.task, advice)
     except CaromError as error:
         raise CaromError(f"{path}: {error}") from error.__cause__
@@ -75,6 +75,9 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
     """
     path = Path(path)
     try:
+        good = isinstance(recording, Recording)
+        advice = "for what `simulate` returns, give carom.recording_of(motion)"
+        require_part(good, "recording", "be a Recording", type(recording).__name__, advice)
         encode = _format(path).encode
         fields = {name: getattr(recording, name) for name in (*ARRAYS, "dt", *TEXTS)}
         checked = Recording.of(**{**fields, "carom_version": _version()})
@@ -225,14 +228,14 @@ _FORMATS = {
 def _format(path: Path) -> _Format:
     suffix = path.suffix.lower()
     wanted = f"have a name that ends in {', '.join(_FORMATS)}"
-    require_part(suffix in _FORMATS, "the file", wanted, repr(suffix), "rename or convert it")
+    require_part(suffix in _FORMATS, "the file", wanted, repr(path.name), "rename or convert it")
     return _FORMATS[suffix]
 
 
 def _read(path: Path) -> dict[str, Any]:
-    decode = _format(path).decode
     require_part(os.path.exists(path), "the file", "exist", "not there", "check its name")
     require_part(os.path.isfile(path), "this", "be a file", "a folder or device", "name a file")
+    decode = _format(path).decode
     try:
         path.open("rb").close()
     except OSError as error:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.checks import require
+from carom.checks import positive, require, require_values
 from carom.contact.energy import dissipative
 from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
@@ -29,12 +29,12 @@ MAX_EVENTS = 24
 """Times at which a step is cut at most, by default, by the rule of events."""
 
 
-def check_compensation_steps(steps: float | None) -> None:
+def check_compensation_steps(steps: float | Float[Array, ""] | None) -> None:
     """Raise `CaromError` unless `steps` is a positive number, or `None` for no compensation."""
-    require(
-        steps is None or 0 < steps < np.inf,
-        f"compensation_steps must be a positive number, or None for no compensation; it was {steps}.",
-    )
+    if steps is None:
+        return
+    require(np.shape(steps) == (), f"compensation_steps must be one number; its shape was {np.shape(steps)}.")
+    require_values("compensation_steps", steps, positive, "a positive number, or None for no compensation")
 
 
 def _as_steps(steps) -> Float[Array, ""] | None:
@@ -58,7 +58,9 @@ class Stepper(eqx.Module):
     contact: bool = eqx.field(static=True, default=True)
     consistent: bool = eqx.field(static=True, default=False)
     impact: ImpactRule = eqx.field(static=True, default="step")
-    events: int = eqx.field(static=True, default=MAX_EVENTS)  # most impacts that a step is cut at, where `impact` is "event"
+    events: int = eqx.field(
+        static=True, default=MAX_EVENTS
+    )  # most impacts that a step is cut at, where `impact` is "event"
 
 
 class StepResult(eqx.Module):

@@ -6,6 +6,8 @@ import diffrax
 import jax
 import numpy as np
 
+from carom.checks import require
+
 _A_LOWER = (np.array([1 / 3]), np.array([-1 / 3, 1.0]), np.array([1.0, -1.0, 1.0]))
 _B = np.array([1 / 8, 3 / 8, 3 / 8, 1 / 8])
 
@@ -26,12 +28,22 @@ class RK4(diffrax.AbstractERK):
         return 4
 
 
+def check_solver(solver) -> None:
+    """Raise `CaromError` unless `solver` is an explicit one-step Runge-Kutta method, or `None` for the default."""
+    explicit = isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau)
+    require(
+        solver is None or explicit or isinstance(solver, diffrax.Euler),
+        "solver must be an explicit Runge-Kutta method of diffrax, such as diffrax.Tsit5(), or carom.RK4(); it was "
+        f"{type(solver).__name__}.",
+    )
+
+
 def flow(solver: diffrax.AbstractSolver, field: Callable, state, dt):
     """`state` after one step of length `dt` (s) under `state' = field(state)`.
 
     Explicit Runge-Kutta methods are written out from the solver's own tableau: `solver.step` runs the stages in a
     checkpointed loop, which makes the backward pass of a learned potential about three times as slow
-    (`benchmarks/bench_integrators.py`). Any other explicit solver goes through `solver.step`.
+    (`benchmarks/bench_integrators.py`). diffrax's Euler, which has none, goes through `solver.step`.
     """
     tableau = getattr(solver, "tableau", None)
     if isinstance(solver, diffrax.AbstractERK) and isinstance(tableau, diffrax.ButcherTableau):

@@ -47,8 +47,18 @@ def _joints(model: Any, *fields) -> np.ndarray:
 def _equalities(mujoco: Any, model: Any) -> Refused:
     kinds = {int(value): name.removeprefix("mjEQ_").lower() for name, value in mujoco.mjtEq.__members__.items()}
     other = (np.asarray(model.eq_type) != int(mujoco.mjtEq.mjEQ_CONNECT)) & np.asarray(model.eq_active0, bool)
-    names = tuple(f"{kinds[int(model.eq_type[k])]} {name_of(model, 'equality', int(k))}" for k in np.flatnonzero(other))
+    names = tuple(_equality(mujoco, model, kinds[int(model.eq_type[k])], int(k)) for k in np.flatnonzero(other))
     return Refused("equality", names, "use connect, or weld bodies by nesting them")
+
+
+def _equality(mujoco: Any, model: Any, kind: str, k: int) -> str:
+    """An equality by its name, or else by what it couples."""
+    site = model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE
+    what = {"weld": "site" if site else "body", "joint": "joint", "tendon": "tendon"}.get(kind)
+    if model.equality(k).name or what is None:
+        return f"{kind} {name_of(model, 'equality', k)}"
+    ends = [name_of(model, what, int(end[k])) for end in (model.eq_obj1id, model.eq_obj2id) if end[k] >= 0]
+    return f"{kind} equality of {what} {' and '.join(ends)}"
 
 
 def _options(mujoco: Any, model: Any) -> Refused:
@@ -102,9 +112,20 @@ CONTACT_KINDS = ("contacts", "rolling", "anisotropic", "margin", "adhesion", "su
 KINDS = (*RULES, *CONTACT_KINDS)
 
 
-def refusals(mujoco: Any, model: Any) -> list[Refused]:
-    """All that is in the model, without contacts."""
+URDF_ADVICE = {
+    "limits": "leave out lower and upper in its <limit>",
+    "damping": "set damping of its <dynamics> to 0",
+    "frictionloss": "set friction of its <dynamics> to 0",
+    "equality": "leave out <mimic>",
+}
+"""What to do in a URDF file, which has other words than MJCF."""
+
+
+def refusals(mujoco: Any, model: Any, *, urdf: bool = False) -> list[Refused]:
+    """All that is in the model, without contacts; `urdf`, whether the advice is for such a file."""
     found = [rule(mujoco, model) for rule in RULES.values()]
+    if urdf:
+        found = [refused._replace(advice=URDF_ADVICE.get(refused.kind, refused.advice)) for refused in found]
     off, flags = model.opt.disableflags, mujoco.mjtDisableBit
     # What MuJoCo itself is told to leave out does nothing.
     silent = {
@@ -128,9 +149,10 @@ def check_ignore(ignore: Collection[str]) -> None:
 def refuse(found: Iterable[Refused], ignore: Collection[str]) -> None:
     """Raise `CaromError` with all that was found, but for the kinds that are to be ignored."""
     left = [refused for refused in found if refused.kind not in ignore]
-    kinds = ", ".join(f'"{kind}"' for kind in dict.fromkeys(refused.kind for refused in left))
+    kinds = [f'"{kind}"' for kind in dict.fromkeys(refused.kind for refused in left)]
+    wanted = kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
     require(
         not left,
         f"the model has what carom cannot represent: {'; '.join(map(str, left))}. Change the model, or leave these out "
-        f"knowingly: load_mujoco(..., ignore=({kinds},)).",
+        f"knowingly: load_mujoco(..., ignore={wanted}).",
     )

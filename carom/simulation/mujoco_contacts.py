@@ -94,8 +94,15 @@ def _combined(model: Any, geoms: tuple[int, int]) -> Touching:
     )
 
 
-def contact_refusals(model: Any, touching: list[Touching]) -> list[Refused]:
-    """What of these contacts carom cannot represent."""
+def fix_mocap(model: Any, touching: list[Touching]) -> list[Touching]:
+    """Make mocap bodies, with what is welded to them, part of the world; returns the pairs that then can touch."""
+    mocap = np.flatnonzero(np.asarray(model.body_mocapid) >= 0)
+    model.body_weldid[np.isin(model.body_weldid, mocap)] = 0
+    return [t for t in touching if model.body_weldid[model.geom_bodyid[list(t.geoms)]].any()]
+
+
+def contact_refusals(model: Any, touching: list[Touching], *, urdf: bool = False) -> list[Refused]:
+    """What of these contacts carom cannot represent; `urdf`, whether the advice is for such a file."""
 
     def some(kind: str, advice: str, which) -> Refused:
         return Refused(kind, tuple(t.name(model) for t in touching if which(t)), advice)
@@ -103,8 +110,9 @@ def contact_refusals(model: Any, touching: list[Touching]) -> list[Refused]:
     found = [
         some(
             "contacts",
-            "carom has spheres, capsules and boxes on planes, and spheres on spheres: exclude the pair with <exclude> "
-            "or contype and conaffinity, or use other geoms",
+            "carom has spheres, capsules and boxes on planes, and spheres on spheres: "
+            + ("leave out a <collision>" if urdf else "exclude the pair with <exclude> or contype and conaffinity")
+            + ", or use other geoms",
             lambda t: not _known(model, t),
         ),
         some("rolling", "torsional and rolling friction: set condim to 3", lambda t: t.condim > 3),

@@ -1,7 +1,7 @@
 """Systems from MJCF and URDF files, read by the optional package `mujoco`."""
 
-import importlib
 import os
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from carom.checks import as_floats, require
+from carom.checks import as_floats, optional_package, require, require_values
 from carom.errors import CaromError
 from carom.mechanics.potentials import Gravity
 from carom.simulation.mujoco_bodies import bodies_of, connects_of, groups_of, joints_of, loops_of, placed, state_of
 from carom.simulation.mujoco_checks import check_ignore, refusals, refuse
-from carom.simulation.mujoco_contacts import contact_refusals, contacts_of, touching_pairs
+from carom.simulation.mujoco_contacts import contact_refusals, contacts_of, fix_mocap, touching_pairs
 from carom.system import System
 
 
@@ -38,16 +38,17 @@ def load_mujoco(
     source: str | os.PathLike[str],
     *,
     keyframe: int | str | None = None,
-    ignore: Collection[str] = (),
+    ignore: str | Collection[str] = (),
     restitution: float = 0.0,
 ) -> MujocoModel:
-    """The system of an MJCF or URDF file, in 3D. Needs the package mujoco: `pip install 'carom[mujoco]'`.
+    """The system of an MJCF or URDF file, in 3D. Needs the package mujoco: `pip install '.[mujoco]'`.
 
     **Arguments:**
 
     - `source`: path of the file, or its XML.
     - `keyframe`: name or number of the keyframe to start from; by default, MuJoCo's reference position at rest.
-    - `ignore`: kinds of elements that carom cannot represent and that are to be left out, such as `("damping",)`.
+    - `ignore`: a kind of elements that carom cannot represent and that are to be left out, such as `"damping"`, or
+      several. A mocap body that is ignored stays where it is.
     - `restitution`: Poisson's e in [0, 1] of all contacts: MuJoCo has none.
 
     Bodies with free, ball, hinge and slide joints, welded bodies (merged), `connect` equalities, gravity; contacts of
@@ -56,14 +57,21 @@ def load_mujoco(
     **Raises:** `CaromError` if mujoco is missing, for files that it cannot read, an unknown keyframe, and for
     everything that carom cannot represent, by name.
     """
-    check_ignore(ignore)
-    mujoco = _package()
+    ignored = (ignore,) if isinstance(ignore, str) else tuple(ignore)
+    check_ignore(ignored)
+    given = as_floats(restitution)
+    require_values("restitution", given, (given >= 0) & (given <= 1), "between 0 and 1")
+    mujoco = optional_package("mujoco", "load_mujoco", "mujoco")
     model = _read(mujoco, source)
-    reference = placed(mujoco, model, model.qpos0)
-    touching = touching_pairs(mujoco, model)
-    refuse([*refusals(mujoco, model), *contact_refusals(model, touching)], ignore)
-    require(model.nv > 0, "the model has no joints: nothing in it moves. Give a body a freejoint, for one.")
     qpos, qvel = _start(model, keyframe)
+    touching = touching_pairs(mujoco, model)
+    if "mocap" in ignored:
+        touching = fix_mocap(model, touching)
+    urdf = _is_urdf(source)
+    refuse([*refusals(mujoco, model, urdf=urdf), *contact_refusals(model, touching, urdf=urdf)], ignored)
+    free = "joint of type floating" if urdf else "freejoint"
+    require(model.nv > 0, f"the model has no joints: nothing in it moves. Give a body a {free}, for one.")
+    reference = placed(mujoco, model, model.qpos0)
     groups = groups_of(model, reference)
     links = joints_of(model, reference, groups)
     links += connects_of(mujoco, model, reference, groups, loops_of(mujoco, model), qpos)
@@ -85,15 +93,6 @@ def load_mujoco(
     )
 
 
-def _package() -> Any:
-    try:
-        return importlib.import_module("mujoco")
-    except ImportError:
-        raise CaromError(
-            "load_mujoco needs the package mujoco, which is not installed: pip install 'carom[mujoco]'."
-        ) from None
-
-
 def _read(mujoco: Any, source: str | os.PathLike[str]) -> Any:
     text = os.fspath(source)
     inline = "<" in text
@@ -105,15 +104,27 @@ def _read(mujoco: Any, source: str | os.PathLike[str]) -> Any:
         raise CaromError(f"MuJoCo cannot read {what}: {' '.join(str(error).split())}") from None
 
 
+def _is_urdf(source: str | os.PathLike[str]) -> bool:
+    """Whether the first element is a URDF's; MuJoCo has read it before."""
+    text = os.fspath(source)
+    content = text if "<" in text else Path(text).read_text(errors="replace")
+    first = re.search(r"<\s*([A-Za-z]\w*)", re.sub(r"<!--.*?-->", "", content, flags=re.DOTALL))
+    return first is not None and first[1] == "robot"
+
+
 def _start(model: Any, keyframe: int | str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities in MuJoCo's coordinates."""
+    """Positions and velocities in MuJoCo's coordinates; mocap bodies, which have none, are put where they start."""
     if keyframe is None:
         return np.array(model.qpos0), np.zeros(model.nv)
+    require(model.nkey > 0, f"the model has no keyframes: keyframe must be None; it was {keyframe!r}.")
     names = [model.key(k).name for k in range(model.nkey)]
     index = names.index(keyframe) if isinstance(keyframe, str) and keyframe in names else keyframe
     require(
         isinstance(index, int | np.integer) and 0 <= index < model.nkey,
-        f"keyframe must be one of {', '.join(map(repr, names)) or 'none'} or a number below {model.nkey}; it was "
-        f"{keyframe!r}.",
+        f"keyframe must be one of {', '.join(map(repr, names))} or a number below {model.nkey}; it was {keyframe!r}.",
     )
+    mocap = np.asarray(model.body_mocapid)
+    moved = mocap >= 0
+    model.body_pos[moved] = model.key_mpos[index].reshape(-1, 3)[mocap[moved]]
+    model.body_quat[moved] = model.key_mquat[index].reshape(-1, 4)[mocap[moved]]
     return np.array(model.key_qpos[index]), np.array(model.key_qvel[index])

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from carom.checks import require
 from carom.errors import CaromError
 from carom.mechanics.bodies import embed_pose, embed_velocity, recover_pose
+from carom.simulation.clock import Irregular, clock_of, digit_of, rounding_of
 from carom.simulation.recording import Recording
 
 NAMES = {
@@ -42,6 +43,8 @@ NAMES = {
     "group": ("group",),
     "dup_of": ("dup_of",),
 }
+POSE_STEP_TOLERANCE = 1e-3
+"""Largest difference of two time steps that count as equal, relative to the step: the clocks of cameras jitter."""
 WINDOW = 3
 """Samples on each side that a velocity is estimated from, as far as no impact lies between."""
 
@@ -199,12 +202,18 @@ def _time_step(arrays: dict[str, np.ndarray]) -> float:
         return float(arrays.pop("dt"))
     require(time is not None and time.ndim == 1 and len(time) > 1, "dt (s) is missing, and there is no time (time,).")
     assert time is not None
-    steps = np.diff(time)
-    require(
-        bool(np.all(np.abs(steps - np.median(steps)) <= 1e-3 * np.median(steps))),
-        f"time must have equal steps; they were {steps.min():.4g} to {steps.max():.4g} s. Resample to one rate.",
-    )
-    return float(np.mean(steps))
+    rows = np.asarray(time, float)[None]
+    require(bool(np.isfinite(rows).all()), "time must be finite. Give dt in its place, or repair it.")
+    valid = np.ones(rows.shape, bool)
+    digit = np.full((1, 1), digit_of(time[None], valid))
+    rounding = 2 * rounding_of(time, float(np.abs(rows).max()))
+    found = clock_of(rows, valid, digit=digit, rounding=rounding, tolerance=POSE_STEP_TOLERANCE)
+    if isinstance(found, Irregular):
+        raise CaromError(
+            f"time must {'increase' if found.back else 'have equal steps'}; that after sample {found.sample} was "
+            f"{found.step:.6g} s, most were {found.typical:.6g} s. Resample to one rate."
+        )
+    return found.step
 
 
 def _padded(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -266,12 +275,23 @@ def with_velocities(poses: PoseRecording) -> PoseRecording:
                 near = np.array([max(t - 1, 0), max(t - 1, 0) + 1])
             time = (near - t) * poses.dt
             basis = np.stack([time**j for j in range(min(3, len(near)))], axis=1)
-            turned = _body_turn(np.broadcast_to(poses.quaternion[k, t], (len(near), 4)), poses.quaternion[k, near])
+            turned, rate = _turns_about_mean(poses.quaternion[k, near], time)
             both = np.concatenate([poses.position[k, near], turned], axis=1)
             slope = np.linalg.lstsq(basis, both, rcond=None)[0][1]
-            velocity[k, t], omega[k, t] = slope[:3], slope[3:]
+            velocity[k, t], omega[k, t] = slope[:3], slope[3:] + rate
     held = (_hold_last(part, poses.length) for part in (velocity, omega))
     return eqx.tree_at(lambda p: (p.velocity, p.omega), poses, tuple(held), is_leaf=lambda part: part is None)
+
+
+def _turns_about_mean(quaternion: Float[np.ndarray, "m 4"], time: Float[np.ndarray, " m"]):
+    """Rotation vectors in the frame of the body at time 0, beyond those of turning at the mean rate; and that rate.
+
+    Those alone would lose whole turns: a rotation vector has at most half a turn.
+    """
+    rate = np.mean(_body_turn(quaternion[:-1], quaternion[1:]), axis=0) / (time[1] - time[0])
+    turns = Rotation.from_quat(quaternion, scalar_first=True)
+    start = turns[int(np.argmin(np.abs(time)))]
+    return (Rotation.from_rotvec(-rate * time[:, None]) * start.inv() * turns).as_rotvec(), rate
 
 
 def _body_turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:

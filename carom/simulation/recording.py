@@ -1,7 +1,7 @@
 """What is recorded of a system's motion, checked: `Recording`, which trajectory files hold (`files.py`)."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import numpy as np
@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float64, Int64
 
 from carom.checks import require
 from carom.errors import CaromError
+from carom.simulation.clock import Irregular, clock_of, digit_of, rounding_of, slack
 from carom.system import System
 
-STEP_TOLERANCE = 1e-6
-"""Largest difference of two time steps that count as equal, relative to the step."""
+OTHER_STEPS = "resample to one step, or split the data there"
 
 STATE_AXES = ("trajectory", "time", "point", "axis")
 
@@ -101,6 +101,28 @@ class Recording(eqx.Module):
         contact, group = (None if part is None else part[rows] for part in (self.contact, self.group))
         return replace(self, x=self.x[rows], v=self.v[rows], contact=contact, length=self.length[rows], group=group)
 
+    def cut(self, samples: int) -> "Recording":
+        """The same motion in pieces of `samples` samples, each a trajectory; what is left over at ends is left out.
+
+        Raises:
+            CaromError: if no trajectory has so many samples.
+        """
+        longest = int(self.length.max())
+        require(2 <= samples <= longest, f"samples must be from 2 to {longest}, the longest; it was {samples}.")
+        rows, starts = np.array(
+            [(k, s) for k, count in enumerate(self.length) for s in range(0, int(count) - samples + 1, samples)]
+        ).T
+        at = rows[:, None], starts[:, None] + np.arange(samples)
+        return replace(
+            self,
+            x=self.x[at],
+            v=self.v[at],
+            contact=None if self.contact is None else self.contact[at],
+            time=self.dt * np.arange(samples),
+            length=np.full(len(rows), samples),
+            group=None if self.group is None else self.group[rows],
+        )
+
 
 def check_system(recording: Recording, system: System, what: str = "the recording") -> None:
     """Raise `CaromError` unless the recording, which the message calls `what`, has the points of the system."""
@@ -128,7 +150,9 @@ def _numbers(name: str, value: Any, axes: tuple[str, ...]) -> np.ndarray:
     wanted = "hold floating-point numbers or integers"
     require_part(array.dtype.kind in "fiu", name, wanted, array.dtype, "convert it to float64")
     wanted = f"have the axes ({', '.join(axes)})"
-    require_part(array.ndim == len(axes), name, wanted, f"of shape {array.shape}", "reshape it")
+    one = axes == STATE_AXES and array.ndim == len(axes) - 1
+    advice = f"for one trajectory give {name}[None]" if one else "reshape it"
+    require_part(array.ndim == len(axes), name, wanted, f"of shape {array.shape}", advice)
     return array
 
 
@@ -232,35 +256,31 @@ def _clock(time: Any, dt: Any, valid: np.ndarray) -> tuple[Float64[np.ndarray, "
     valid = valid if raw.ndim == 2 else inside
     array = _doubles(raw)
     _check_finite("time", array, valid, axes)
-    array = np.where(valid, array, 0.0)
+    rows, valid = np.atleast_2d(np.where(valid, array, 0.0)), np.atleast_2d(valid)
     # A time was rounded to the digits it was stored with: half a unit at either end of a step, and
     # as much again where times were added up.
-    last = np.max(np.abs(array)).astype(raw.dtype)
-    rounding = 2 * float(np.spacing(last)) if raw.dtype.kind == "f" else 0.0
-    _check_steps(array, valid, rounding, axes)
+    rounding = 2 * rounding_of(raw, float(np.max(np.abs(rows))))
+    digit = digit_of(np.atleast_2d(raw), valid)
+    found = clock_of(rows, valid, digit=np.full((1, 1), digit), rounding=rounding, step=dt)
+    if isinstance(found, Irregular):
+        _refuse(found, axes)
 
-    row = (array[longest] if raw.ndim == 2 else array)[inside]
-    with np.errstate(over="ignore"):
-        step = time_step((row[-1] - row[0]) / (len(row) - 1))
-    good = dt is None or abs(dt - step) <= STEP_TOLERANCE * step + rounding
+    step, rows = time_step(found.step), found.time
+    row = rows[longest if raw.ndim == 2 else 0][inside]
+    good = dt is None or abs(dt - step) <= slack(step, digit, rounding, len(row))
     require_part(good, "dt", f"be the step of time, {step:.9g} s", dt, "correct whichever is wrong")
     dt = step if dt is None else dt
-    if (array[..., 0] != row[0]).any():
+    if (rows[..., 0] != row[0]).any():
         row = row - row[0]
     beyond = row[0] + dt * np.arange(len(row), samples)
     return np.concatenate([row, beyond]), dt
 
 
-def _check_steps(time: np.ndarray, valid: np.ndarray, rounding: float, axes: tuple[str, ...]) -> None:
-    valid = valid[..., 1:]
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported as unequal
-        steps = np.diff(time, axis=-1)
-        typical = float(np.median(steps[valid]))
-        back = ~(steps > 0) & valid
-        uneven = ~(np.abs(steps - typical) <= STEP_TOLERANCE * typical + rounding) & valid
-    for bad, wanted in ((back, "increase"), (uneven, "have equal steps")):
-        if bad.any():
-            raise CaromError(
-                f"time must {wanted}; the step after {_place(bad, axes)} was {steps[bad][0]:.9g} s, "
-                f"most were {typical:.9g} s; resample to one step, or split the data there."
-            )
+def _refuse(found: Irregular, axes: tuple[str, ...]) -> NoReturn:
+    place = ", ".join(
+        f"{axis} {k}" for axis, k in zip(axes, (found.trajectory, found.sample)[-len(axes) :], strict=True)
+    )
+    raise CaromError(
+        f"time must {'increase' if found.back else 'have equal steps'}; the step after {place} was {found.step:.9g} s, "
+        f"most were {found.typical:.9g} s; {'give times with more digits' if found.coarse else OTHER_STEPS}."
+    )

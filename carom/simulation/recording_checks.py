@@ -7,6 +7,9 @@ from jaxtyping import Bool, Float
 
 from carom.simulation.recording import Recording
 
+ENOUGH = 2
+"""Fewer trajectories are one recording alone."""
+
 
 class Finding(NamedTuple):
     """One check: what was found, and what to do about it ("" if nothing)."""
@@ -40,6 +43,10 @@ def check_recording(recording: Recording) -> list[Finding]:
         Finding("speed, median and largest", f"{np.median(speed):.3g}, {speed.max():.3g} m/s", ""),
         Finding("way of a step, typical", f"{motion:.2g} m", "" if motion > 0 else "nothing moves"),
     ]
+    if recording.n_trajectories < ENOUGH:
+        count = f"{recording.n_trajectories} of up to {int(recording.length.max())} samples"
+        advice = "several starts tell more; `carom learn` cuts these into pieces (in Python: recording.cut(samples))"
+        out.append(Finding("trajectories", count, advice))
     noise = position_noise(recording)
     if noise is not None and motion > 0:
         share = noise / motion
@@ -77,10 +84,26 @@ def position_noise(recording: Recording) -> float | None:
     Of independent errors of variance s^2 a third difference has 20 s^2; smooth motion adds `dt^3 x'''`, which is why
     this is a bound. The median leaves impacts out.
     """
-    ends = recording.valid[:, 3:]
+    return _third_differences(recording.x, recording.valid)
+
+
+def state_noise(recording: Recording) -> float:
+    """At most this share of a typical state, positions and velocities together (m, m/s), is noise; as `position_noise`.
+
+    0 of short trajectories.
+    """
+    parts = (recording.x, recording.v)
+    sizes = [_third_differences(part, recording.valid) or 0.0 for part in parts]
+    square = sum(np.sum(part[recording.valid] ** 2, axis=(1, 2)) for part in parts)
+    numbers = recording.n_points * recording.dim
+    return float(np.sqrt(numbers * np.sum(np.square(sizes))) / max(np.sqrt(np.median(square)), 1e-300))
+
+
+def _third_differences(part: Float[np.ndarray, "N T n d"], valid: Bool[np.ndarray, "N T"]) -> float | None:
+    ends = valid[:, 3:]
     if ends.shape[1] == 0 or not ends.any():
         return None
-    third = np.diff(recording.x, n=3, axis=1)[ends]
+    third = np.diff(part, n=3, axis=1)[ends]
     return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
 
 

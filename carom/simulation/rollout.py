@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.checks import as_floats, is_known, require, require_values
+from carom.checks import is_known, positive, require, require_values
 from carom.contact.impulses import ContactModel
 from carom.mechanics.dynamics import FIELDS, Formulation
 from carom.simulation.impact import (
     COMPENSATION_STEPS,
-    MAX_EVENTS,
     IMPACT_RULES,
+    MAX_EVENTS,
     ImpactRule,
     Stepper,
     StepResult,
@@ -22,8 +22,9 @@ from carom.simulation.impact import (
     impact_at,
     smooth_flow,
 )
-from carom.simulation.integrators import RK4
+from carom.simulation.integrators import RK4, check_solver
 from carom.simulation.segments import step_in_segments
+from carom.simulation.start_checks import check_initial_state, in_one_precision
 from carom.system import System
 
 
@@ -32,7 +33,8 @@ class Trajectory(eqx.Module):
 
     `x`, `v` (..., time, n, d) in m and m/s; `contact` (..., time): the step that ends here had a closed contact; `time`
     (time,) in s; `overflow` (..., time): closed contacts that found no place in the solver; `residual` (..., time): the
-    solver's relative residual. `simulate` raises where the last two say that a result is wrong, unless it is traced.
+    solver's relative residual, infinite where the state is not finite. `simulate` raises where the last two say that a
+    result is wrong, unless it is traced.
     """
 
     x: Float[Array, "*b time n d"]
@@ -78,13 +80,16 @@ def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) ->
     def start(first, rest):
         return jnp.concatenate([jnp.asarray(first, rest.dtype)[None], rest])
 
+    x, v, residual = start(x0, out.x), start(v0, out.v), start(0, out.residual)
+    # What is not finite was not solved, although no contact can be seen in it.
+    finite = jnp.isfinite(x).all((-1, -2)) & jnp.isfinite(v).all((-1, -2))
     return Trajectory(
-        x=start(x0, out.x),
-        v=start(v0, out.v),
+        x=x,
+        v=v,
         contact=start(False, out.contact),
         time=stepper.dt * jnp.arange(steps + 1, dtype=x0.dtype),
         overflow=start(0, out.overflow),
-        residual=start(0, out.residual),
+        residual=jnp.where(finite, residual, jnp.inf),
     )
 
 
@@ -96,6 +101,14 @@ def _simulate(system, x0, v0, stepper, steps, force):
         x0, v0, force
     )
     return eqx.tree_at(lambda t: t.time, out, out.time[0])
+
+
+def _nothing(stepper: Stepper, x0: Float[Array, "0 n d"], steps: int) -> Trajectory:
+    """The trajectories of no state at all."""
+    x = jnp.zeros((0, steps + 1, *x0.shape[1:]), x0.dtype)
+    flags = jnp.zeros((0, steps + 1), bool)
+    time = stepper.dt * jnp.arange(steps + 1, dtype=x0.dtype)
+    return Trajectory(x, x, flags, time, overflow=flags.astype(int), residual=flags.astype(x0.dtype))
 
 
 def simulate(
@@ -111,7 +124,7 @@ def simulate(
     force: Float[Array, "*b steps n d"] | None = None,
     formulation: Formulation = "lagrangian",
     solver: diffrax.AbstractSolver | None = None,
-    compensation_steps: float | None = COMPENSATION_STEPS,
+    compensation_steps: float | Float[Array, ""] | None = COMPENSATION_STEPS,
     contact_model: str | ContactModel | None = None,
     smoothing: float = 0.0,
     throw: bool = True,
@@ -120,7 +133,8 @@ def simulate(
 
     **Arguments:**
 
-    - `x0`, `v0`: (n, d) or (N, n, d), positions (m) and velocities (m/s) of the points.
+    - `x0`, `v0`: (n, d) or (N, n, d), positions (m) and velocities (m/s) of the points. All is computed in the widest
+      precision among these, the system and the force, but at least in single.
     - `dt`, `steps`: time step (s) and number of steps.
     - `impact`: `"step"` integrates a whole step and lets the contacts act that are closed at its end. `"event"` cuts
       the step at the times at which contacts close and lets them act there: derivatives through impacts are right then.
@@ -128,37 +142,39 @@ def simulate(
     - `project`: bring each step's end back onto the constraints.
     - `force`: (steps, n, d) or (N, steps, n, d) in N, held over each step, added to the generalised force.
     - `formulation`: `"lagrangian"` or `"hamiltonian"`; the same motion.
-    - `solver`: any explicit diffrax solver; by default `RK4`.
-    - `compensation_steps`: time steps over which penetration is undone, or `None` to leave it.
+    - `solver`: an explicit Runge-Kutta method of diffrax, such as `Tsit5()`; by default `RK4`.
+    - `compensation_steps`: time steps over which penetration is undone where nothing pushes it back, or `None` to
+      leave it.
     - `contact_model`: `"cm"`, `"cmr"`, `"lcp"` or a `ContactModel`, in place of the system's own.
     - `smoothing`: see `solve_impulse`.
     - `throw`: raise on a result that is not right, where it can be seen (outside of jit). If false, or traced, look at
       `Trajectory.overflow` and `Trajectory.residual`.
 
     **Raises:** `CaromError` for shapes that do not fit, NaN, a start inside a wall or off the constraints, more closed
-    contacts than `max_active`, an unsolved contact, motion that is not finite, an unknown contact model.
+    contacts than `max_active`, an unsolved contact, motion that is not finite, an unknown contact model, a solver that
+    is not an explicit Runge-Kutta method.
     """
     if contact_model is not None:
         system = system.with_contact_model(contact_model)
-    x0, v0 = as_floats(x0), as_floats(v0)
+    system, x0, v0, force = in_one_precision(system, x0, v0, force)
     require(impact in IMPACT_RULES, f"impact must be one of {sorted(IMPACT_RULES)}; it was {impact!r}.")
-    require(
-        isinstance(max_events, int | np.integer) and max_events > 0,
-        f"max_events must be a positive whole number; it was {max_events}.",
-    )
+    for name, count in (("max_events", max_events), ("steps", steps)):
+        require(
+            isinstance(count, int | np.integer) and count > 0,
+            f"{name} must be a positive whole number; it was {count}.",
+        )
     require(formulation in FIELDS, f"formulation must be one of {sorted(FIELDS)}; it was {formulation!r}.")
-    require(
-        isinstance(steps, int | np.integer) and steps > 0, f"steps must be a positive whole number; it was {steps}."
-    )
-    require_values("dt", dt, np.asarray(dt) > 0 if is_known(dt) else True, "a positive number of seconds")
+    require(np.shape(dt) == (), f"dt must be one number of seconds; its shape was {np.shape(dt)}.")
+    require_values("dt", dt, positive, "a positive number of seconds")
     check_compensation_steps(compensation_steps)
+    check_solver(solver)
+    require(is_known(smoothing), "smoothing must be a known number; it was traced by JAX.")
     require(
         impact == "step" or system.step_model is None,
         f'impact must be "step" for a system with a step_model, which is blind to events; it was {impact!r}.',
     )
-    check_initial_state(system, x0, v0)
+    check_initial_state(system, x0, v0, dt=dt, compensation_steps=compensation_steps)
     if force is not None:
-        force = as_floats(force)
         wanted = (*x0.shape[:-2], steps, *x0.shape[-2:])
         if force.shape == wanted[-3:]:
             force = jnp.broadcast_to(force, wanted)
@@ -173,45 +189,12 @@ def simulate(
         impact=impact,
         events=int(max_events),
     )
+    if x0.shape[0] == 0 and x0.ndim == 3:
+        return _nothing(stepper, x0, int(steps))
     out = _simulate(system, x0, v0, stepper, int(steps), force)
     if throw:
         check_trajectory(system, out)
     return out
-
-
-def check_initial_state(system: System, x0, v0) -> None:
-    """Raise `CaromError` for initial states that cannot be: shapes, NaN, inside walls, off the constraints."""
-    shape = (system.n_points, system.dim)
-    require(
-        x0.shape[-2:] == shape and x0.ndim in (2, 3),
-        f"x0 must have the shape {shape} or (N, {shape[0]}, {shape[1]}) for this system; it was {x0.shape}.",
-    )
-    require(x0.shape == v0.shape, f"v0 must have the shape of x0, {x0.shape}; it was {v0.shape}.")
-    if not is_known(x0, v0, system):
-        return
-    for name, value in (("x0", x0), ("v0", v0)):
-        require(bool(np.isfinite(value).all()), f"{name} must be finite; it had NaN or infinite values.")
-    x = x0.reshape(-1, *shape)
-    gaps = np.asarray(system.gaps(x))
-    through = gaps < -np.asarray(system.reach()) - 1e-9
-    if through.any():
-        state, candidate = np.argwhere(through)[0]
-        bodies = [b for contact in system.contacts for b in contact.bodies_of()][candidate]
-        raise_through(int(state), bodies, float(-gaps[state, candidate]))
-    drift = np.abs(np.asarray(system.constraints(x)))
-    if drift.size and drift.max() > 2e-2:
-        state, row = np.unravel_index(drift.argmax(), drift.shape)
-        require(
-            False,
-            f"x0 does not obey the constraints: equation {row} of state {state} is off by {drift.max():.2g} m^2. "
-            "Start from positions that fit the rods and joints (carom.sample gives such).",
-        )
-
-
-def raise_through(state: int, bodies: tuple[int, ...], depth: float) -> None:
-    """Say which bodies start inside each other or a wall."""
-    where = f"body {bodies[0]} is inside a wall" if len(bodies) == 1 else f"bodies {bodies[0]} and {bodies[1]} overlap"
-    require(False, f"x0 starts in an impossible place: in state {state}, {where} ({depth:.3g} m deep). Move it out.")
 
 
 def check_trajectory(system: System, trajectory: Trajectory) -> None:
@@ -234,6 +217,11 @@ def check_trajectory(system: System, trajectory: Trajectory) -> None:
             + ". Use a smaller dt, or look at the potential.",
         )
     worst = float(np.max(trajectory.residual))
+    require(
+        np.isfinite(worst),
+        "bodies move so far in a time step, beside their size, that it cannot be told which of them meet. Use a "
+        "smaller dt.",
+    )
     allowed = 1e-6 if trajectory.x.dtype == jnp.float64 else 1e-2
     require(
         worst <= allowed,

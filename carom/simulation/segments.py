@@ -5,8 +5,8 @@ and stay are found, with the constant forces, each in the contact's own frame, b
 first order. The motion is integrated under them. At the end the law is met by what is still missing of their impulses,
 impacts happen, and penetration is undone.
 
-What rests is held: where the forces cancel the others, the state is a fixed point of the step, to rounding. Where forces
-are constant (sliding, rolling on a plane) the motion is exact, else of second order in the time step.
+What rests is held: where these forces cancel the others, the state is a fixed point of the step, to rounding. Where
+forces are constant (sliding on a plane) the motion is exact, else of second order in the time step.
 
 By the rule `"step"` a step is one segment, and contacts that close within it act at its end. By `"event"` it is cut at
 the times at which contacts close.
@@ -18,14 +18,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import anywhere
 from carom.contact.energy import dissipative, islands
 from carom.contact.impulses import ContactState, Jump
 from carom.contact.penetration import pushes
-from carom.simulation.events import may_close, next_event, own_times, to_event
-from carom.simulation.impact import Stepper, StepResult, closed_contacts, compensation_steps_of
+from carom.simulation.events import may_close, next_event, own_times, to_event, touching
+from carom.simulation.impact import Stepper, StepResult, closed_contacts, compensation_steps_of, has_impulses
 from carom.simulation.projection import project_state
 from carom.system import System
 
@@ -38,8 +39,12 @@ _CLOSING = 0.5
 _LEAVING = 1e-3
 """Closed contacts that leave faster than this share leave; those that do not stay."""
 _REBOUNDS = {"step": 1.0, "event": 0.05}
-"""An impact from which a contact would leave slower than this share of what the accelerations take back within a step has
-no rebound. By the rule of events it grows with the events of the step: what comes to rest does so after finitely many."""
+"""An impact from which a contact would leave slower than this share of what the accelerations take back within a step
+has no rebound. By the rule of events it grows with the events of the step: what comes to rest does so after few."""
+
+
+_AT_REST = 0.6
+"""A body rests if it moves by less than this power of the machine's precision, of what its acceleration alone would."""
 
 
 class _Progress(NamedTuple):
@@ -53,6 +58,7 @@ class _Progress(NamedTuple):
     overflow: Int[Array, ""]
     residual: Float[Array, ""]
     missed: Bool[Array, ""]
+    push: Float[Array, " n"]  # m/s^2, of the points without contact, at the start of the step
 
 
 class _Segment(NamedTuple):
@@ -65,6 +71,7 @@ class _Segment(NamedTuple):
     lasts: Bool[Array, " C"]
     closed: Bool[Array, " C"]
     gain: Float[Array, " C"]  # m/s, what the accelerations give contacts in a whole step, at most
+    push: Float[Array, " n"]  # m/s^2, of the points without contact, at the start
     again: Bool[Array, ""]  # the step has been cut here: there is more of it
     contact: Bool[Array, ""]
     overflow: Int[Array, ""]
@@ -82,10 +89,10 @@ def step_in_segments(
     """One step with contact; `motion` is that of `smooth_flow`."""
     no, zero = jnp.asarray(False), jnp.zeros((), x.dtype)
     none = jnp.zeros(system.n_candidates, bool)
-    start = _Progress(x, v, stepper.dt, none, no, jnp.asarray(0), zero, no)
+    start = _Progress(x, v, stepper.dt, none, no, jnp.asarray(0), zero, no, jnp.zeros_like(x[:, 0]))
     segment = _Stepping(system, inverse_mass, stepper, motion)
     if stepper.impact == "step":
-        return _result(segment(start, jnp.asarray(0)))
+        return _result(system, start, segment(start, jnp.asarray(0)))
 
     def part(now: _Progress, count):
         goes_on = now.left > 0
@@ -97,10 +104,10 @@ def step_in_segments(
         return jax.lax.cond(anywhere(goes_on), go_on, lambda: now), None
 
     def with_contact():
-        # What a segment computes is computed again for the derivative: kept, it would be that of all segments that a step
-        # may have, of which most have one.
+        # What a segment computes is computed again for the derivative: kept, it would be that of all segments that a
+        # step may have, of which most have one.
         end, _ = jax.lax.scan(jax.checkpoint(part), start, jnp.arange(stepper.events + 1))
-        return _result(end)
+        return _result(system, start, end)
 
     _, after = motion
     end = after((x, v), stepper.dt)
@@ -112,10 +119,23 @@ def step_in_segments(
     return jax.lax.cond(anywhere(near), with_contact, alone)
 
 
-def _result(end: _Progress) -> StepResult:
+def _result(system: System, start: _Progress, end: _Progress) -> StepResult:
     # A step that would need more events than it may have is not solved.
     residual = jnp.where(end.missed, jnp.inf, end.residual)
-    return StepResult(end.x, end.v, end.contact, end.overflow, residual)
+    # Rounding moves what rests, and an unstable equilibrium multiplies it. A body that has moved by no more stays where
+    # it was, without a velocity; derivatives are those of the motion.
+    body = np.searchsorted(np.array(system.table.center), np.arange(system.n_points), side="right") - 1
+    least = jnp.finfo(end.x.dtype).eps ** _AT_REST * start.left * end.push
+    moves = (_size(end.x - start.x) > least * start.left) | (_size(end.v) > least)
+    rests = ~jnp.zeros(len(system.bodies), bool).at[body].max(moves)[body][:, None]
+    x = end.x + jax.lax.stop_gradient(jnp.where(rests, start.x - end.x, 0))
+    v = end.v - jax.lax.stop_gradient(jnp.where(rests, end.v, 0))
+    return StepResult(x, v, end.contact, end.overflow, residual)
+
+
+def _size(vectors: Float[Array, "n d"]) -> Float[Array, " n"]:
+    """Largest coordinate of each, without a derivative."""
+    return jnp.max(jnp.abs(jax.lax.stop_gradient(vectors)), axis=1)
 
 
 class _Stepping:
@@ -133,7 +153,20 @@ class _Stepping:
         forces = jnp.zeros((self.system.n_candidates, self.system.dim), now.x.dtype)
         none = jnp.zeros_like(now.acted)
         no = jnp.asarray(False)
-        start = _Segment(now.x, now.v, zero, forces, none, none, forces[:, 0], no, no, now.overflow, now.residual)
+        start = _Segment(
+            x=now.x,
+            v=now.v,
+            time=zero,
+            pressing=forces,
+            lasts=none,
+            closed=none,
+            gain=forces[:, 0],
+            push=now.push,
+            again=no,
+            contact=no,
+            overflow=now.overflow,
+            residual=now.residual,
+        )
 
         # Both ends are one program, run twice: most of it is the solver.
         def end_of(state: _Segment, first: Bool[Array, ""]):
@@ -155,6 +188,7 @@ class _Stepping:
             overflow=end.overflow,
             residual=end.residual,
             missed=now.missed | (end.again & (count == self.stepper.events)),
+            push=jnp.where(count == 0, end.push, now.push),
         )
 
     def touching(self, state: _Segment, left: Float[Array, ""]) -> tuple[_Segment, Float[Array, "C d"]]:
@@ -167,25 +201,28 @@ class _Stepping:
 
         (velocity, candidates), (change, _) = jax.jvp(seen, (state.x, state.v), motion)
         # What the accelerations of the points can give a contact: no direction and no cancellation is in it.
-        push = jnp.linalg.norm(motion[1], axis=-1)[candidates.stencil]
+        size = jax.lax.stop_gradient(jnp.linalg.norm(motion[1], axis=-1))
+        push = size[candidates.stencil]
         gain = jax.lax.stop_gradient(
             self.stepper.dt * jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * push, axis=1)
         )
         normal, gap = jax.lax.stop_gradient((velocity[:, 0], candidates.gap))
         lasts = (gap <= _NEAR * left * gain) & (normal >= -_CLOSING * gain) & (normal <= _LEAVING * gain)
-        return state._replace(lasts=lasts, closed=lasts, gain=gain), change * left
+        if not has_impulses(self.system, state.x, state.v, self.stepper):
+            lasts = jnp.zeros_like(lasts)
+        return state._replace(lasts=lasts, closed=lasts, gain=gain, push=size), change * left
 
     def act(
         self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""], count: Int[Array, ""]
     ) -> tuple[_Segment, Float[Array, "C d"]]:
         """Let contacts act at an end of a segment: those that last are held, the others hit.
 
-        At the first end nothing is changed: what is found is the impulses (N s) that contacts which last will need by the
-        other, if their velocities change by `change` (m/s) without them.
+        At the first end nothing is changed: what is found is the impulses (N s) that contacts which last will need by
+        the other, if their velocities change by `change` (m/s) without them.
         """
         system, stepper = self.system, self.stepper
         contacts = closed_contacts(system, state.x, state.v, self.inverse_mass, stepper, state.closed)
-        index, active = contacts.active.index, contacts.active.active
+        index, active = contacts.active.candidate, contacts.active.active
         k, d = contacts.velocity.shape
         held = state.lasts[index] & active
         past = jnp.where(held[:, None], state.time * state.pressing[index], 0)
@@ -203,21 +240,25 @@ class _Stepping:
         class Acting(NamedTuple):
             velocity: Float[Array, "K d"]  # of the contacts
             change: Float[Array, "K d"]  # impulses by which the state's velocity changes
+            other: Float[Array, "n d"]  # what it changes by beside them, if the model has none
 
         def part(acting: Acting, hits: Bool[Array, ""]):
             hit = active & ~held & (acting.velocity[:, 0] < 0) & ~first
             these = jnp.where(hits, active & jnp.any(together & hit, axis=1), held)
             problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, hits, slow)
             jump = dissipative(problem, system.contact_model(problem, smoothing=stepper.smoothing))
-            impulse = _total(jump)
-            impulse = impulse - jnp.where(hits, 0, past)
+            if jump.impulse is None:
+                return acting._replace(other=acting.other + jnp.where(hits & ~first, jump.velocity, 0)), jump
+            impulse = jnp.sum(jump.impulse, axis=0) - jnp.where(hits, 0, past)
             velocity = acting.velocity + (contacts.delassus @ impulse.reshape(-1)).reshape(k, d)
-            return Acting(velocity, acting.change + impulse), jump
+            return acting._replace(velocity=velocity, change=acting.change + impulse), jump
 
-        acting, jumps = jax.lax.scan(part, Acting(before, jnp.zeros_like(past)), jnp.array([False, True]))
+        acting, jumps = jax.lax.scan(
+            part, Acting(before, jnp.zeros_like(past), jnp.zeros_like(state.v)), jnp.array([False, True])
+        )
         hit_jump = jax.tree.map(lambda a: a[1], jumps)
         wanted = jnp.zeros_like(state.pressing).at[index].add(jnp.where(held[:, None], acting.change, 0))
-        kick = jnp.einsum("rid,r->id", contacts.response, acting.change.reshape(-1))
+        kick = acting.other + jnp.einsum("rid,r->id", contacts.response, acting.change.reshape(-1))
         new = state._replace(
             overflow=jnp.maximum(state.overflow, contacts.active.overflow),
             residual=jnp.maximum(state.residual, jnp.max(jumps.residual)),
@@ -234,7 +275,7 @@ class _Stepping:
         stepper = self.stepper
         x, v = state.x, state.v + kick
         if stepper.impact == "event":
-            x = x - own_times(contacts, jump, stepper.dt)
+            x = x - own_times(contacts, jump, stepper.dt, touching(self.still, x))
         if stepper.compensation_steps is None:
             return x, v
         d = velocity.shape[1]
@@ -246,16 +287,14 @@ class _Stepping:
         x = x + jnp.einsum("kid,k->id", contacts.response[::d], push)
         return project_state(self.system.constraints, x, v, self.inverse_mass) if stepper.project else (x, v)
 
-    def move(
-        self, state: _Segment, impulse: Float[Array, "C d"], now: _Progress, count: Int[Array, ""]
-    ) -> _Segment:
+    def move(self, state: _Segment, impulse: Float[Array, "C d"], now: _Progress, count: Int[Array, ""]) -> _Segment:
         """From the start of a segment, where contacts that last want an `impulse` (N s), to its other end."""
         left = now.left
         pressing = impulse / jnp.where(left > 0, left, 1)
         begin = (state.x, state.v)
         end = self.after(begin, left, pressing)
         if self.stepper.impact == "step":
-            time, again = left, jnp.asarray(False)
+            time, again, unsure = left, jnp.asarray(False), jnp.asarray(False)
             closed = jax.lax.stop_gradient(self.system.gaps(end[0])) < 0
         else:
             still = jax.lax.stop_gradient((begin, end, left))
@@ -269,10 +308,16 @@ class _Stepping:
 
             met, time, closed, again = to_event(begin, left, event, self.system, (rate, after))
             end = jax.tree.map(lambda a, b: jnp.where(again, a, b), met, end)
-            time = jnp.where(again, time, left)
+            time, unsure = jnp.where(again, time, left), event.unsure
             closed = jnp.where(again, closed, jax.lax.stop_gradient(self.system.gaps(end[0])) < 0)
         return state._replace(
-            x=end[0], v=end[1], time=time, pressing=pressing, closed=closed | state.lasts, again=again
+            x=end[0],
+            v=end[1],
+            time=time,
+            pressing=pressing,
+            closed=closed | state.lasts,
+            again=again,
+            residual=jnp.where(unsure, jnp.inf, state.residual),  # what could not be looked at is not right
         )
 
 
@@ -290,10 +335,3 @@ def _only(contacts: ContactState, these: Bool[Array, " K"], velocity, reference,
         reference=jnp.where(these[:, None], reference, 0),
         rebounds=rebounds,
     )
-
-
-def _total(jump: Jump) -> Float[Array, "K d"]:
-    """The impulses of all phases together."""
-    if jump.impulse is None:
-        raise AssertionError("a contact model without impulses does not come here")
-    return jnp.sum(jump.impulse, axis=0)

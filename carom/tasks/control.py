@@ -24,7 +24,8 @@ from carom.learning.progress import LoopProgress
 from carom.learning.run import RunFolder
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.impact import COMPENSATION_STEPS, IMPACT_RULES, ImpactRule
-from carom.simulation.rollout import Trajectory, check_initial_state, check_trajectory, simulate
+from carom.simulation.rollout import Trajectory, check_trajectory, simulate
+from carom.simulation.start_checks import check_initial_state
 from carom.system import System
 
 Choice = dict[str, Array]
@@ -252,7 +253,13 @@ def optimize(
     config.check()
     begun, first = time.monotonic(), control.start() if start is None else start
     setup = control.setup(system, first)
-    check_initial_state(setup.system, as_floats(setup.x0), as_floats(setup.v0))
+    check_initial_state(
+        setup.system,
+        as_floats(setup.x0),
+        as_floats(setup.v0),
+        dt=control.dt,
+        compensation_steps=physics.compensation_steps,
+    )
     optimizer, halvings = _make_optimizer(control, config)
     key = jax.random.key(config.seed)
     rows: list[dict[str, float]] = []

@@ -5,7 +5,6 @@ direction without perspective, so that spheres are disks of their own radius and
 as in 2D.
 """
 
-import importlib.util
 import os
 import warnings
 from collections.abc import Iterable
@@ -26,6 +25,7 @@ from PIL import Image
 from carom.checks import require
 from carom.simulation.rollout import Trajectory
 from carom.system import System
+from carom.view.extras import check_movies
 from carom.view.scene import (
     ALONE_LOOK,
     PREDICTED_LOOK,
@@ -103,11 +103,8 @@ def animate(
     """
     path = checked_path(path, (".gif", ".mp4"))
     movie = path.suffix.lower() == ".mp4"
-    require(
-        not movie or importlib.util.find_spec("imageio_ffmpeg") is not None,
-        "path asks for an MP4, which needs the package imageio-ffmpeg. Install it (pip install "
-        "imageio-ffmpeg), or choose a path that ends in .gif.",
-    )
+    if movie:
+        check_movies("path")
     require(fps > 0, f"fps must be positive; it was {fps}.")
     require(speed is None or speed > 0, f"speed must be positive; it was {speed}.")
     require(trail is None or trail >= 0, f"trail must not be negative; it was {trail}.")
