@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from carom.checks import as_floats, optional_package, require, require_values
+from carom.checks import as_floats, is_share, optional_package, require, require_values
 from carom.errors import CaromError
 from carom.mechanics.potentials import Gravity
 from carom.simulation.mujoco_bodies import bodies_of, connects_of, groups_of, joints_of, loops_of, placed, state_of
@@ -60,7 +60,7 @@ def load_mujoco(
     ignored = (ignore,) if isinstance(ignore, str) else tuple(ignore)
     check_ignore(ignored)
     given = as_floats(restitution)
-    require_values("restitution", given, (given >= 0) & (given <= 1), "between 0 and 1")
+    require_values("restitution", given, is_share, "between 0 and 1")
     mujoco = optional_package("mujoco", "load_mujoco", "mujoco")
     model = _read(mujoco, source)
     qpos, qvel = _start(model, keyframe)
