@@ -46,7 +46,9 @@ def test_what_friction_holds_stays_where_it_is(impact, length, mass):
 @pytest.mark.parametrize("model", ["coulomb", "lcp"])
 def test_a_block_slides_as_it_should(model):
     """Constant forces: exact but for rounding, and without a hop."""
-    motion = carom.simulate(on_slope(carom.PointMass(1.0, 0.1), 0.2, contact_model=model), BLOCK, REST, dt=0.01, steps=100)
+    motion = carom.simulate(
+        on_slope(carom.PointMass(1.0, 0.1), 0.2, contact_model=model), BLOCK, REST, dt=0.01, steps=100
+    )
     acceleration = GRAVITY * (np.sin(SLOPE) - 0.2 * np.cos(SLOPE))
     time = np.asarray(motion.time)
     moved = np.asarray(motion.x[:, 0] - BLOCK[0])
@@ -95,7 +97,9 @@ def test_a_dropped_ball_has_no_sideways_speed_whatever_its_axes():
     assert jnp.max(jnp.abs(motion.v[:, :, 0, :2])) < 1e-12
     spin = (motion.v[:, :, 1:] - motion.v[:, :, :1]) * 0.1
     assert jnp.max(jnp.abs(spin)) < 1e-12
-    np.testing.assert_allclose(motion.x[:, :, 0], jnp.broadcast_to(motion.x[:1, :, 0], motion.x[:, :, 0].shape), atol=1e-12)
+    np.testing.assert_allclose(
+        motion.x[:, :, 0], jnp.broadcast_to(motion.x[:1, :, 0], motion.x[:, :, 0].shape), atol=1e-12
+    )
 
 
 def pyramid(length=1.0, mass=1.0):

@@ -28,11 +28,11 @@ from carom.contact.cones import solve_cones
 #     H_n = y_n - max(lower, y_n - u_n)
 #     H_t = y_t - proj(y_t - rho u_t, disc of radius mu max(lower, y_n - u_n)),    rho = 1 / (a bound of |A_tt|)
 #
-# semi-smooth. The law may have several solutions: what friction can hold may also slip. The start is the solution of the
-# convex program (`cones.py`), whose velocities have the least energy: where something can be held it is held there, and
-# then that is the solution. Newton steps onto the modes that are seen there (open or held by the bound, sticking, sliding)
-# end in it elsewhere. Where they do not, sweeps of projected Gauss-Seidel follow, and steps with a diagonal that is made
-# smaller by and by.
+# semi-smooth. The law may have several solutions: what friction can hold may also slip. The start is the solution of
+# the convex program (`cones.py`), whose velocities have the least energy: where something can be held it is held there,
+# and then that is the solution. Newton steps onto the modes that are seen there (open or held by the bound, sticking,
+# sliding) end in it elsewhere. Where they do not, sweeps of projected Gauss-Seidel follow, and steps with a diagonal
+# that is made smaller by and by.
 #
 # Where A is singular the impulse is not unique. A diagonal `delta A_nn` on each contact's own block selects that of
 # least norm, each contact weighted by its own mobility: a norm (an energy) that knows no frame and no unit. A last step
@@ -46,7 +46,7 @@ _CONVERGED = 1e-12
 _SWEEPS = 24
 _STEPS = 10
 _ROUNDS = 8
-"""Rounds of sweeps and steps, each with twice the sweeps of the one before; most problems take the first, without any."""
+"""Rounds of sweeps and steps, each with twice the sweeps of the last; most problems take the first, without any."""
 _LENGTHS = (1.0, 0.5, 0.2, 0.05)
 """Shares of a Newton step that are tried."""
 _NEAR_APEX = 1e-5
@@ -353,14 +353,15 @@ def _solve_block(A, v, friction, lower, reference, start, rounds, *, sensitivity
     """Solve one block of problems from `start` (N s), batch first in and out."""
     finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction).all(1)
     finite = finite & (lower < jnp.inf).all(1)
-    A = jnp.where(finite[:, None, None], A, 0)
-    v, start = (jnp.where(finite[:, None, None], part, 0) for part in (v, start))
-    friction = jnp.where(finite[:, None], friction, 0)
-    problem, size, unit = _scale(A, v, friction, jnp.where(finite[:, None], lower, 0), reference)
+
+    def sound(x: Array) -> Array:
+        return jnp.asarray(jnp.where(finite.reshape(-1, *(1,) * (x.ndim - 1)), x, 0))
+
+    problem, size, unit = _scale(sound(A), sound(v), sound(friction), sound(lower), reference)
     scale = size[:, None] * unit
-    start = jnp.moveaxis(start, 0, -1) / jnp.where(scale > 0, scale, jnp.inf)
+    start = jnp.moveaxis(sound(start), 0, -1) / jnp.where(scale > 0, scale, jnp.inf)
     found = _search(problem, start, jnp.max(rounds, initial=0))
-    nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
+    nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
     solution = CoulombSolution(jnp.moveaxis(found.y * scale + nan, -1, 0), jnp.where(finite, found.residual, jnp.inf))
     return solution, _sensitivity(problem, found.y, (lower >= 0).T, size, unit) if sensitivity else None
 

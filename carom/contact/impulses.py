@@ -280,6 +280,6 @@ def _vanishing(matrix: Float[Array, "r r"], d: int) -> Float[Array, " r"]:
 
 def _solve_regular(matrix, rhs, diagonal):
     """`(matrix + diagonal)^-1 rhs`; rows of zeros count as those of the identity."""
-    diagonal = jnp.where(diagonal > 0, diagonal, jnp.where(jnp.diag(matrix) > 0, 0, 1))
+    diagonal = jnp.asarray(jnp.where(diagonal > 0, diagonal, jnp.where(jnp.diag(matrix) > 0, 0, 1)), matrix.dtype)
     matrix = matrix + jnp.diag(diagonal)
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
