@@ -166,7 +166,7 @@ def test_what_is_stacked_rests(scene, dt, steps):
 
 @pytest.mark.parametrize("impact", ["step", "event"])
 def test_a_ball_comes_to_rest_and_never_gains_energy(impact):
-    """By events to rounding; by steps but for the depth that is undone, which is a step's fall at the speed of impact."""
+    """By events to rounding; by steps but for the depth that is undone, a share of a step at the speed of impact."""
     system = carom.System(
         bodies=[carom.PointMass(1.0, 0.1)],
         contacts=[carom.DiskPlane([0], (0.0, 0.0), (0.0, 1.0))],

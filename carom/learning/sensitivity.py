@@ -55,6 +55,8 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
     """
     x, v = start
     system = unknowns.assemble(skeleton)
+    if skeleton.contacts and system.compensation != "paper":
+        return _of_whole_step(unknowns, skeleton, stepper, start, end)
     free = dataclasses.replace(stepper, contact=False)
     masses = jnp.zeros(0 if unknowns.log_mass_ratio is None else unknowns.log_mass_ratio.shape, x.dtype)
 
@@ -68,29 +70,15 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
     def coarse(nudge):
         coarser = dataclasses.replace(free, solver=diffrax.Midpoint())
         moved, force = system, nudge["weights"] if by_force else None
-        if not by_force and potential is not None:
-            weights = (
-                w + change.astype(w.dtype)
-                for w, change in zip(potential.linear_weights(), nudge["weights"], strict=True)
-            )
-            moved = eqx.tree_at(lambda s: s.potential, system, potential.with_linear_weights(tuple(weights)))
+        if not by_force:
+            moved = _with_weights(system, potential, nudge["weights"])
         out = step(moved, x + nudge["x"], v + nudge["v"], coarser, force)
         return out.x, out.v
 
-    if by_force:
-        nothing = jnp.zeros_like(x)
-    else:
-        nothing = () if potential is None else tuple(jnp.zeros_like(w, x.dtype) for w in potential.linear_weights())
+    nothing = _no_weights(potential, x)
     by_mass, (x1, v1) = jax.jacfwd(flow, has_aux=True)({"mass": masses})
     by_state = jax.jacfwd(coarse)({"x": jnp.zeros_like(x), "v": jnp.zeros_like(x), "weights": nothing})
-    if skeleton.contacts:
-        active = system.active(x1)
-        place = jnp.where(active.active, active.property_index, skeleton.n_properties)
-        # A property of two closed contacts gets one column, else its derivative would be counted twice.
-        twice = jnp.any(jnp.tril(place[:, None] == place[None, :], -1), axis=1)
-        column = jnp.where(twice, skeleton.n_properties, place)
-    else:
-        place = column = jnp.zeros(0, int)
+    place, column = _columns(system, x1) if skeleton.contacts else (jnp.zeros(0, int),) * 2
 
     def touch(nudge):
         if not skeleton.contacts:
@@ -135,6 +123,88 @@ def step_sensitivity(unknowns: Unknowns, skeleton: System, stepper: Stepper, sta
         column=column,
         gap_before=system.gaps(x),
         gap=system.gaps(x1),
+        gap_slope=jax.jacfwd(system.gaps)(x).reshape(-1, x.size),
+        property=place,
+        jump=jnp.linalg.norm(jump.velocity),
+        normal=impulse[..., 0],
+        tangential=jnp.linalg.norm(impulse[..., 1:], axis=-1),
+    )
+
+
+def _columns(system: System, x: Float[Array, "n d"]) -> tuple[Int[Array, " K"], Int[Array, " K"]]:
+    """The property of each contact that is closed at `x`, and which of these get a column of their own.
+
+    A property of two closed contacts gets one, else its derivative would be counted twice.
+    """
+    active = system.active(x)
+    place = jnp.where(active.active, active.property_index, system.n_properties)
+    twice = jnp.any(jnp.tril(place[:, None] == place[None, :], -1), axis=1)
+    return place, jnp.where(twice, system.n_properties, place)
+
+
+def _no_weights(potential: NeuralPotential | None, x: Float[Array, "n d"]):
+    """No change of the weights, or, of a network, of the forces."""
+    if potential is None:
+        return ()
+    if potential.network is not None:
+        return jnp.zeros_like(x)
+    return tuple(jnp.zeros_like(w, x.dtype) for w in potential.linear_weights())
+
+
+def _with_weights(system: System, potential: NeuralPotential | None, change) -> System:
+    """The system with the weights changed in which its potential is linear."""
+    if potential is None:
+        return system
+    weights = (w + d.astype(w.dtype) for w, d in zip(potential.linear_weights(), change, strict=True))
+    return eqx.tree_at(lambda s: s.potential, system, potential.with_linear_weights(tuple(weights)))
+
+
+def _of_whole_step(unknowns: Unknowns, skeleton: System, stepper: Stepper, start, end) -> StepSensitivity:
+    """`step_sensitivity` where contact acts over the step, which does not fall into a motion and a jump."""
+    x, v = start
+    system, potential = unknowns.assemble(skeleton), unknowns.potential
+    by_force = potential is not None and potential.network is not None
+    reached = step(system, x, v, stepper)
+    place, column = _columns(system, reached.x)
+    zeros = jnp.zeros(column.shape, x.dtype)
+    nothing = {
+        "mass": jnp.zeros(0 if unknowns.log_mass_ratio is None else unknowns.log_mass_ratio.shape, x.dtype),
+        "friction": zeros,
+        "restitution": zeros,
+        "log_epsilon": jnp.zeros(0 if unknowns.log_epsilon is None else 1, x.dtype),
+        "x": jnp.zeros_like(x),
+        "v": jnp.zeros_like(x),
+        "weights": _no_weights(potential, x),
+    }
+
+    def whole(nudge):
+        moved = _nudged(unknowns, nudge, skeleton, column)
+        if not by_force:
+            moved = _with_weights(moved, potential, nudge["weights"])
+        out = step(moved, x + nudge["x"], v + nudge["v"], stepper, nudge["weights"] if by_force else None)
+        return jnp.concatenate([out.x.reshape(-1), out.v.reshape(-1)])
+
+    by = jax.jacfwd(whole)(nothing)
+    rows = {name: by[name].reshape(2 * x.size, -1) for name in nothing if name != "weights"}
+    if by_force:
+        weights = by["weights"].reshape(2 * x.size, -1) @ force_features(potential, x)
+    else:
+        parts = [w.reshape(2 * x.size, -1) for w in by["weights"]]
+        weights = jnp.concatenate([jnp.zeros((2 * x.size, 0), x.dtype), *parts], axis=1)
+    free = step(system, x, v, dataclasses.replace(stepper, contact=False))
+    _, jump = contact_jump(system, free.x, free.v, system.inverse_mass_matrix(), stepper, system.gaps(reached.x) < 0)
+    impulse = jnp.zeros((0, len(column), x.shape[1]), x.dtype) if jump.impulse is None else jump.impulse
+    return StepSensitivity(
+        residual=jnp.concatenate([(reached.x - end[0]).reshape(-1), (reached.v - end[1]).reshape(-1)]),
+        log_mass_ratio=rows["mass"],
+        friction=rows["friction"],
+        restitution=rows["restitution"],
+        log_epsilon=rows["log_epsilon"],
+        state=jnp.concatenate([rows["x"], rows["v"]], axis=1),
+        weights=weights,
+        column=column,
+        gap_before=system.gaps(x),
+        gap=system.gaps(reached.x),
         gap_slope=jax.jacfwd(system.gaps)(x).reshape(-1, x.size),
         property=place,
         jump=jnp.linalg.norm(jump.velocity),

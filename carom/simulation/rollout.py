@@ -25,7 +25,7 @@ from carom.simulation.impact import (
 from carom.simulation.integrators import RK4, check_solver
 from carom.simulation.segments import step_in_segments
 from carom.simulation.start_checks import check_initial_state, in_one_precision
-from carom.system import System
+from carom.system import Compensation, System
 
 
 class Trajectory(eqx.Module):
@@ -126,6 +126,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     compensation_steps: float | Float[Array, ""] | None = COMPENSATION_STEPS,
     contact_model: str | ContactModel | None = None,
+    compensation: Compensation | None = None,
     smoothing: float = 0.0,
     throw: bool = True,
 ) -> Trajectory:
@@ -138,14 +139,15 @@ def simulate(
     - `dt`, `steps`: time step (s) and number of steps.
     - `impact`: `"step"` integrates a whole step and lets the contacts act that are closed at its end. `"event"` cuts
       the step at the times at which contacts close and lets them act there: derivatives through impacts are right then.
-    - `max_events`: most times at which a step is cut; what comes after is left to the rule of `"step"`.
+    - `max_events`: most times at which a step may be cut; more are an error.
     - `project`: bring each step's end back onto the constraints.
     - `force`: (steps, n, d) or (N, steps, n, d) in N, held over each step, added to the generalised force.
     - `formulation`: `"lagrangian"` or `"hamiltonian"`; the same motion.
     - `solver`: an explicit Runge-Kutta method of diffrax, such as `Tsit5()`; by default `RK4`.
     - `compensation_steps`: time steps over which penetration is undone where nothing pushes it back, or `None` to
       leave it.
-    - `contact_model`: `"cm"`, `"cmr"`, `"lcp"` or a `ContactModel`, in place of the system's own.
+    - `contact_model`: `"coulomb"`, `"cm"`, `"cmr"`, `"lcp"` or a `ContactModel`, in place of the system's own.
+    - `compensation`: `"mass"` or `"paper"`, in place of the system's own (see `System`).
     - `smoothing`: see `solve_impulse`.
     - `throw`: raise on a result that is not right, where it can be seen (outside of jit). If false, or traced, look at
       `Trajectory.overflow` and `Trajectory.residual`.
@@ -156,6 +158,8 @@ def simulate(
     """
     if contact_model is not None:
         system = system.with_contact_model(contact_model)
+    if compensation is not None:
+        system = system.with_compensation(compensation)
     system, x0, v0, force = in_one_precision(system, x0, v0, force)
     require(impact in IMPACT_RULES, f"impact must be one of {sorted(IMPACT_RULES)}; it was {impact!r}.")
     for name, count in (("max_events", max_events), ("steps", steps)):
@@ -219,8 +223,8 @@ def check_trajectory(system: System, trajectory: Trajectory) -> None:
     worst = float(np.max(trajectory.residual))
     require(
         np.isfinite(worst),
-        "bodies move so far in a time step, beside their size, that it cannot be told which of them meet. Use a "
-        "smaller dt.",
+        "a time step has more impacts than max_events, or bodies move so far in it, beside their size, that it cannot "
+        "be told which of them meet. Use a smaller dt, or a larger max_events.",
     )
     allowed = 1e-6 if trajectory.x.dtype == jnp.float64 else 1e-2
     require(
