@@ -406,7 +406,7 @@ def test_what_cannot_be_looked_at_is_an_error():
         dim=2,
     )
     x0, v0 = jnp.array([[0.0, 0.0], [0.0, 0.021]]), jnp.array([[1e5, 0.0], [1e5, 0.0]])
-    with refused("bodies move so far in a time step, beside their size, that it cannot be told which of them meet"):
+    with refused("a time step has more impacts than max_events, or bodies move so far in it, beside their size"):
         carom.simulate(system, x0, v0, dt=0.01, steps=2, impact="event")
 
 
