@@ -28,7 +28,7 @@ class ContactState(NamedTuple):
     friction: Float[Array, " K"]
     restitution: Float[Array, " K"]
     reference: Float[Array, "K d"] | None = None  # velocities beside which others are rounding, if not `velocity`
-    rebounds: Bool[Array, ""] | bool = True  # if not, nothing is asked for after compression: contacts that last
+    rebounds: Bool[Array, ""] | None = None  # if false, nothing is asked for after compression: contacts that last
 
 
 class Jump(NamedTuple):
@@ -157,7 +157,8 @@ class LCP(ContactModel):
 
     def __call__(self, state, *, smoothing=0.0):
         require(smoothing == 0, f"smoothing must be 0 with the contact model LCP; it was {smoothing}.")
-        bounce = -state.restitution * jnp.minimum(state.velocity[:, 0], 0) * state.rebounds
+        bounce = -state.restitution * jnp.minimum(state.velocity[:, 0], 0)
+        bounce = bounce if state.rebounds is None else jnp.where(state.rebounds, bounce, 0)
         target = state.target[:, 0]
         # Where both are equal, as at e = 0 without compensation, the derivative is that of the bounce, for a growing e.
         rebound = jnp.where(bounce >= target, bounce, target)

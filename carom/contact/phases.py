@@ -87,14 +87,14 @@ def two_phases(
     smoothing: float = 0.0,
     coulomb: bool = False,
     reference: Array | None = None,
-    rebounds: Bool[Array, ""] | bool = True,
+    rebounds: Bool[Array, ""] | None = None,
 ) -> tuple[Phase, Phase]:
     """`contact_impulse` without its checks, with the solver's residuals.
 
     `diagonal` (..., K d) is added to that of A in the convex programs alone, not where velocities are computed.
     `coulomb`: each phase obeys Coulomb's law, in place of the convex programs (see `Coulomb`). `reference` (..., K, d):
-    velocities (m/s) beside which others are rounding; `v` itself by default. Without `rebounds` the second phase is
-    nothing, and costs nothing.
+    velocities (m/s) beside which others are rounding; `v` itself by default. Where `rebounds` is false the second
+    phase is nothing, and costs nothing.
     """
     reference = v if reference is None else reference
     program = A if diagonal is None else A + diagonal[..., None] * jnp.eye(A.shape[-1], dtype=A.dtype)
@@ -104,7 +104,8 @@ def two_phases(
         velocity, lower = state
         velocity = velocity - jnp.where(is_rebound, v_star, 0)
         least = jnp.where(is_rebound, lower, -jnp.inf)
-        matrix = jnp.where(is_rebound & ~jnp.asarray(rebounds), 0, program)  # zeros are no contacts
+        none = False if rebounds is None else is_rebound & ~rebounds
+        matrix = jnp.where(none, 0, program)  # zeros are no contacts
         solution = _solve(matrix, velocity, friction, least, smoothing, reference=reference, coulomb=coulomb)
         change = (A @ solution.impulse.reshape(*v.shape[:-2], -1, 1)).reshape(v.shape)
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
