@@ -35,6 +35,8 @@ def drop(compensation_steps: float | None) -> carom.Trajectory:
         contacts=[carom.DiskPlane([0], point=(0.0, 0.0), normal=(0.0, 1.0))],
         potential=carom.Gravity((0.0, -9.81)),
         restitution=0.0,
+        contact_model="cm",
+        compensation="paper",
     )
     x0 = jnp.array([[0.0, RADIUS + HEIGHT]])
     return carom.simulate(
