@@ -235,7 +235,7 @@ class _Stepping:
         together = islands(contacts.delassus, d)
         reference = jnp.maximum(jnp.abs(free), jnp.abs(before))
         slow = jnp.minimum(_REBOUNDS[stepper.impact] * jnp.asarray(2.0, before.dtype) ** (count / 2), 1.0)
-        slow = slow.astype(before.dtype) * state.gain[index]
+        rebounds = self.rebounds(contacts, before, state.gain[index], slow.astype(before.dtype), together)
 
         class Acting(NamedTuple):
             velocity: Float[Array, "K d"]  # of the contacts
@@ -245,7 +245,9 @@ class _Stepping:
         def part(acting: Acting, hits: Bool[Array, ""]):
             hit = active & ~held & (acting.velocity[:, 0] < 0) & ~first
             these = jnp.where(hits, active & jnp.any(together & hit, axis=1), held)
-            problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, hits, slow)
+            restitution = jnp.where(hits, rebounds, 0)
+            problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, restitution)
+            problem = problem._replace(rebounds=hits)
             jump = dissipative(problem, system.contact_model(problem, smoothing=stepper.smoothing))
             if jump.impulse is None:
                 return acting._replace(other=acting.other + jnp.where(hits & ~first, jump.velocity, 0)), jump
@@ -269,6 +271,17 @@ class _Stepping:
             lambda: (*self.after_impact(new, contacts, hit_jump, kick, acting.velocity), jnp.any(active)),
         )
         return new._replace(x=rest[0], v=rest[1], contact=rest[2]), wanted
+
+    def rebounds(self, contacts: ContactState, velocity, gain, slow, together) -> Float[Array, " K"]:
+        """The restitutions, or none where the rebound of an island's hardest hit contact would be too `slow` to matter.
+
+        In shares of what the accelerations `gain` (m/s) within a step: contacts may be in m/s and in rad/s.
+        """
+        approach = jnp.where(contacts.active.active, jnp.maximum(-velocity[:, 0], 0), 0)
+        hit = jnp.where(gain > 0, approach / jnp.where(gain > 0, gain, 1), jnp.where(approach > 0, jnp.inf, 0))
+        hardest = jnp.max(jnp.where(together, hit, 0), axis=1, initial=0)
+        fast = jax.lax.stop_gradient(contacts.restitution * hardest > slow)
+        return jnp.where(fast, contacts.restitution, 0)
 
     def after_impact(self, state: _Segment, contacts: ContactState, jump: Jump, kick, velocity) -> State:
         """The state with its velocity changed, and with penetration undone as far as this segment does."""
@@ -321,17 +334,15 @@ class _Stepping:
         )
 
 
-def _only(contacts: ContactState, these: Bool[Array, " K"], velocity, reference, rebounds, slow) -> ContactState:
-    """The problem of `these` contacts alone, with their velocities; rebounds that would be `slow` (m/s) are none."""
+def _only(contacts: ContactState, these: Bool[Array, " K"], velocity, reference, restitution) -> ContactState:
+    """The problem of `these` contacts alone, with other velocities and restitutions."""
     d = velocity.shape[1]
     rows = jnp.repeat(these, d)
-    fast = jax.lax.stop_gradient(-contacts.restitution * velocity[:, 0] > slow)
     return contacts._replace(
         active=contacts.active._replace(active=contacts.active.active & these),
         delassus=jnp.where(rows[:, None] & rows, contacts.delassus, 0),
         velocity=jnp.where(these[:, None], velocity, 0),
         target=jnp.zeros_like(velocity),
-        restitution=jnp.where(jnp.asarray(rebounds) & fast, contacts.restitution, 0),
+        restitution=restitution,
         reference=jnp.where(these[:, None], reference, 0),
-        rebounds=rebounds,
     )

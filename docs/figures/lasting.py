@@ -2,7 +2,7 @@
 
     python -m docs.figures.lasting [FILE.png]
 
-A block on a slope of 20 degrees, with friction that holds it (mu = .6) and friction that does not (mu = .2), 10 ms steps.
+A block on a slope of 20 degrees, with friction that holds it (mu = .6) or does not (mu = .2), in steps of 10 ms.
 """
 
 from pathlib import Path
