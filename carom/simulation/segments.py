@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import anywhere
+from carom.contact.candidates import Candidates
 from carom.contact.energy import dissipative, islands
 from carom.contact.impulses import ContactState, Jump
 from carom.contact.penetration import pushes
@@ -124,13 +125,17 @@ def _result(system: System, start: _Progress, end: _Progress) -> StepResult:
     residual = jnp.where(end.missed, jnp.inf, end.residual)
     # Rounding moves what rests, and an unstable equilibrium multiplies it. A body that has moved by no more stays where
     # it was, without a velocity; derivatives are those of the motion.
-    body = np.searchsorted(np.array(system.table.center), np.arange(system.n_points), side="right") - 1
+    body = _body_of_point(system)
     least = jnp.finfo(end.x.dtype).eps ** _AT_REST * start.left * end.push
     moves = (_size(end.x - start.x) > least * start.left) | (_size(end.v) > least)
     rests = ~jnp.zeros(len(system.bodies), bool).at[body].max(moves)[body][:, None]
     x = end.x + jax.lax.stop_gradient(jnp.where(rests, start.x - end.x, 0))
     v = end.v - jax.lax.stop_gradient(jnp.where(rests, end.v, 0))
     return StepResult(x, v, end.contact, end.overflow, residual)
+
+
+def _body_of_point(system: System) -> Int[np.ndarray, " n"]:
+    return np.searchsorted(np.array(system.table.center), np.arange(system.n_points), side="right") - 1
 
 
 def _size(vectors: Float[Array, "n d"]) -> Float[Array, " n"]:
@@ -200,17 +205,24 @@ class _Stepping:
             return jnp.einsum("cipj,cpj->ci", candidates.rows, v[candidates.stencil]), candidates
 
         (velocity, candidates), (change, _) = jax.jvp(seen, (state.x, state.v), motion)
-        # What the accelerations of the points can give a contact: no direction and no cancellation is in it.
         size = jax.lax.stop_gradient(jnp.linalg.norm(motion[1], axis=-1))
-        push = size[candidates.stencil]
-        gain = jax.lax.stop_gradient(
-            self.stepper.dt * jnp.sum(jnp.linalg.norm(candidates.rows[:, 0], axis=-1) * push, axis=1)
-        )
+        gain = self.stepper.dt * jax.lax.stop_gradient(self.accelerations(candidates, motion[1]))
         normal, gap = jax.lax.stop_gradient((velocity[:, 0], candidates.gap))
         lasts = (gap <= _NEAR * left * gain) & (normal >= -_CLOSING * gain) & (normal <= _LEAVING * gain)
         if not has_impulses(self.system, state.x, state.v, self.stepper):
             lasts = jnp.zeros_like(lasts)
         return state._replace(lasts=lasts, closed=lasts, gain=gain, push=size), change * left
+
+    def accelerations(self, candidates: Candidates, a: Float[Array, "n d"]) -> Float[Array, " C"]:
+        """How the bodies of each candidate are accelerated there (m/s^2), added up as if all were against each other.
+
+        Of material points, so that no body axes are in it, nor a direction of contact.
+        """
+        body = _body_of_point(self.system)[candidates.stencil]
+        which = np.array([np.unique(row, return_inverse=True)[1].reshape(-1) for row in body])
+        mine = np.eye(which.max() + 1)[which].astype(a.dtype)  # (C, P, bodies of one)
+        material = jnp.einsum("cipj,cpj,cpb->cbi", candidates.rows, a[candidates.stencil], mine)
+        return jnp.sum(jnp.linalg.norm(material, axis=-1), axis=1)
 
     def act(
         self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""], count: Int[Array, ""]
