@@ -378,7 +378,8 @@ def test_a_contact_model_is_chosen_by_name_or_given(name, kind):
 
 
 def test_simulate_takes_another_contact_model_than_the_systems():
-    system, start = ball_on_floor(friction=0.5, gravity=0.0), (jnp.array([[0.0, 0.1]]), jnp.array([[3.0, -1.0]]))
+    system = ball_on_floor(friction=0.5, gravity=0.0).with_contact_model("cm")
+    start = jnp.array([[0.0, 0.1]]), jnp.array([[3.0, -1.0]])
     options = {"dt": 1e-3, "steps": 1}
     over = simulate(system, *start, contact_model="lcp", **options)
     own = simulate(system.with_contact_model("lcp"), *start, **options)

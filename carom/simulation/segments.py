@@ -40,8 +40,8 @@ _CLOSING = 0.5
 _LEAVING = 1e-3
 """Closed contacts that leave faster than this share leave; those that do not stay."""
 _REBOUNDS = {"step": 1.0, "event": 0.05}
-"""An impact from which a contact would leave slower than this share of what the accelerations take back within a step
-has no rebound. By the rule of events it grows with the events of the step: what comes to rest does so after few."""
+"""An impact slower than this share of what the accelerations give within a step has no rebound. By the rule of events it
+grows with the events of the step: what comes to rest does so after few."""
 
 
 _AT_REST = 0.6
@@ -285,15 +285,14 @@ class _Stepping:
         return new._replace(x=rest[0], v=rest[1], contact=rest[2]), wanted
 
     def rebounds(self, contacts: ContactState, velocity, gain, slow, together) -> Float[Array, " K"]:
-        """The restitutions, or none where the rebound of an island's hardest hit contact would be too `slow` to matter.
+        """The restitutions, or none where an island's hardest hit is too `slow` to matter.
 
         In shares of what the accelerations `gain` (m/s) within a step: contacts may be in m/s and in rad/s.
         """
         approach = jnp.where(contacts.active.active, jnp.maximum(-velocity[:, 0], 0), 0)
         hit = jnp.where(gain > 0, approach / jnp.where(gain > 0, gain, 1), jnp.where(approach > 0, jnp.inf, 0))
         hardest = jnp.max(jnp.where(together, hit, 0), axis=1, initial=0)
-        fast = jax.lax.stop_gradient(contacts.restitution * hardest > slow)
-        return jnp.where(fast, contacts.restitution, 0)
+        return jnp.where(jax.lax.stop_gradient(hardest > slow), contacts.restitution, 0)
 
     def after_impact(self, state: _Segment, contacts: ContactState, jump: Jump, kick, velocity) -> State:
         """The state with its velocity changed, and with penetration undone as far as this segment does."""
