@@ -40,8 +40,8 @@ _CLOSING = 0.5
 _LEAVING = 1e-3
 """Closed contacts that leave faster than this share leave; those that do not stay."""
 _REBOUNDS = {"step": 1.0, "event": 0.05}
-"""An impact slower than this share of what the accelerations give within a step has no rebound. By the rule of events it
-grows with the events of the step: what comes to rest does so after few."""
+"""An impact slower than this share of what the accelerations give within a step has no rebound. By the rule of events
+it grows with the events of the step: what comes to rest does so after few."""
 
 
 _AT_REST = 0.6
