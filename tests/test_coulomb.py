@@ -104,6 +104,8 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(along, jnp.sum(weight * slope), rtol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_one_contact_by_hand():
     """Sticks, slides and leaves: in closed form for `A = 1`."""
     v = jnp.array([[[-1.0, 0.2]], [[-1.0, 3.0]], [[0.5, 3.0]]])
@@ -111,6 +113,7 @@ def test_one_contact_by_hand():
     np.testing.assert_allclose(out.impulse[:, 0], [[1, -0.2], [1, -0.5], [0, 0]], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_named():
     out = solve(jnp.eye(2)[None], jnp.full((1, 1, 2), jnp.nan), jnp.ones((1, 1)))
     assert np.isnan(out.impulse).all()

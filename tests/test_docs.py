@@ -63,9 +63,10 @@ def test_what_is_to_be_copied_works(page, tmp_path, monkeypatch, capsys):
     names: dict = {"__name__": "page"}
     exec(compile(blocks_of(page), page, "exec"), names)
     if page == "own-contact.md":
-        # A step of .005 s at 5 m/s, of which the target velocity takes back an eighth a step.
+        # A step of .005 s at 5 m/s is as deep as a body gets; an eighth of it is taken back in a step, by lifting it.
         assert float(names["system"].gaps(names["motion"].x).min()) > -0.03
-        assert (np.diff(names["energy"]) < 1e-6).all()  # contacts only take energy, and here little is penetration
+        assert (np.diff(names["energy"]) < 1.5 * 9.81 * 0.03 / 8).all()
+        assert (names["energy"] < names["energy"][0] * (1 + 1e-9)).all()
         differences = (names["last_height"](0.6 + 1e-6) - names["last_height"](0.6 - 1e-6)) / 2e-6
         assert float(names["slope"]) == pytest.approx(float(differences), rel=1e-5)
     if page == "own-system.md":

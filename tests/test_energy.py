@@ -41,6 +41,7 @@ def test_impacts_add_no_energy(model):
     assert np.max(gained[residual < 1e-8]) < 1e-10
 
 
+@pytest.mark.slow
 def test_a_gain_of_newtons_hypothesis_is_in_the_residual():
     """One contact is hit and presses the other together, which was opening: that one is stopped, and pushes."""
     A = np.array([[[1.0, 0, -0.9, 0], [0, 1, 0, 0], [-0.9, 0, 1, 0], [0, 0, 0, 1]]])
@@ -63,7 +64,8 @@ def test_islands_are_what_acts_on_each_other():
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("gap", [1e-3, 1e-6])
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [pytest.param(1e-3, marks=pytest.mark.ci_budget), 1e-6])
 def test_the_last_ball_of_a_cradle_leaves_with_the_speed_of_the_first(gap):
     """Balls in a row, a little apart, e = 1: all impacts are within one time step."""
     count, radius, speed = 5, 0.05, 1.0

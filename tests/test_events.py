@@ -442,10 +442,10 @@ def test_what_rests_or_bounces_ever_faster_is_left_to_the_rule_of_the_step():
             given.x, given.v, dt=0.01, steps=200, impact="event",
         )  # fmt: skip
         gap = np.asarray(out.x[:, 0, 1]) - RADIUS
-        # A ball rests where compensation, over 8 steps, gives it the speed g dt / 2: 4 g dt^2 deep.
-        assert gap.min() > -4.01 * GRAVITY * 0.01**2
-        assert abs(gap[-1]) < 4.01 * GRAVITY * 0.01**2
-        assert np.abs(out.v[-1, 0, 1]) < 2 * GRAVITY * 0.01
+        # CM lifts what slides, so that it hops until it stops sliding.
+        assert gap.min() > -GRAVITY * 0.01**2
+        np.testing.assert_allclose(gap[-1], 0, atol=1e-6)
+        np.testing.assert_allclose(out.v[-1], 0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -456,8 +456,8 @@ def test_impacts_within_one_step():
     fine = at_end(system, given, TIME / 100, 100)
     once = at_end(system, given, TIME, 1)
     assert np.allclose(np.concatenate(once), np.concatenate(fine), atol=1e-9)
-    cut_once = at_end(system, given, TIME, 1, max_events=1)
-    assert not np.allclose(np.concatenate(cut_once), np.concatenate(fine), atol=1e-3)
+    with refused("a time step has more impacts than max_events"):
+        at_end(system, given, TIME, 1, max_events=1)
 
 
 @pytest.mark.slow

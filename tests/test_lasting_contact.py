@@ -29,8 +29,17 @@ BLOCK = jnp.array([0.1 * OUT])
 REST = jnp.zeros((1, 2))
 
 
-@pytest.mark.parametrize("impact", ["step", "event"])
-@pytest.mark.parametrize(("length", "mass"), [(1.0, 1.0), (1e-3, 1e-6), (1e3, 1e6)])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("impact", "length", "mass"),
+    [
+        pytest.param("step", 1.0, 1.0, marks=pytest.mark.ci_budget),
+        ("step", 1e-3, 1e-6),
+        ("step", 1e3, 1e6),
+        ("event", 1.0, 1.0),
+        ("event", 1e-3, 1e-6),
+    ],
+)
 def test_what_friction_holds_stays_where_it_is(impact, length, mass):
     """For 10 s; all lengths times `length`, and times its root in time: the same motion."""
     system = on_slope(carom.PointMass(mass, 0.1 * length), 0.6)
@@ -43,6 +52,7 @@ def test_what_friction_holds_stays_where_it_is(impact, length, mass):
         assert jnp.max(jnp.abs(motion.v)) < 1e-9 * length**0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["coulomb", "lcp"])
 def test_a_block_slides_as_it_should(model):
     """Constant forces: exact but for rounding, and without a hop."""
@@ -57,6 +67,8 @@ def test_a_block_slides_as_it_should(model):
     np.testing.assert_allclose(moved @ OUT, 0, atol=1e-13)
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_a_disk_rolls_down_a_slope():
     """With 2/3 g sin: within 1e-4 at 10 ms, and of second order in the time step."""
     system = on_slope(disk(), 1.0)
@@ -81,6 +93,7 @@ def ball_on_floor(**options):
     )
 
 
+@pytest.mark.slow
 def test_a_ball_that_slides_ends_rolling():
     """Angular momentum about the floor is kept: 5/7 of its speed, whatever friction is."""
     x0 = embed_pose(jnp.array([0.0, 0.0, 0.1]), jnp.eye(3))
@@ -89,6 +102,8 @@ def test_a_ball_that_slides_ends_rolling():
     np.testing.assert_allclose(motion.v[-1, 0], [10 / 7, 0, 0], atol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 def test_a_dropped_ball_has_no_sideways_speed_whatever_its_axes():
     turns = Rotation.random(100, random_state=0).as_matrix()
     x0 = jnp.stack([embed_pose(jnp.array([0.0, 0.0, 0.15]), jnp.asarray(turn)) for turn in turns])
@@ -164,6 +179,8 @@ def test_what_is_stacked_rests(scene, dt, steps):
     assert jnp.max(jax.vmap(system.kinetic_energy)(motion.v)) < 1e-12
 
 
+@pytest.mark.slow
+@pytest.mark.ci_budget
 @pytest.mark.parametrize("impact", ["step", "event"])
 def test_a_ball_comes_to_rest_and_never_gains_energy(impact):
     """By events to rounding; by steps but for the depth that is undone, a share of a step at the speed of impact."""
@@ -183,6 +200,7 @@ def test_a_ball_comes_to_rest_and_never_gains_energy(impact):
         assert np.max(np.diff(energy)) < 1e-12 * energy[0]
 
 
+@pytest.mark.slow
 def test_derivatives_through_lasting_contact_are_those_of_differences():
     """By friction and by the speed at the start, forward and reverse: a ball that slides, then rolls; and one held."""
     x0 = embed_pose(jnp.array([0.0, 0.0, 0.1]), jnp.eye(3))
