@@ -17,7 +17,7 @@ def pushes(normal: Float[Array, "K K"], wanted: Float[Array, " K"]) -> Float[Arr
     each other do not meet.
     """
     own = jnp.diagonal(normal)
-    size = jnp.where(own > 0, 1 / jnp.sqrt(jnp.where(own > 0, own, 1)), 0)
+    size = jnp.where(own > 0, jax.lax.rsqrt(jnp.asarray(jnp.where(own > 0, own, 1))), 0)
     scaled = size[:, None] * normal * size
     stiff = jnp.maximum(jnp.sum(jnp.abs(scaled), axis=1), 1)
 

@@ -286,7 +286,8 @@ class _Stepping:
         In shares of what the accelerations `gain` (m/s) within a step: contacts may be in m/s and in rad/s.
         """
         approach = jnp.where(contacts.active.active, jnp.maximum(-velocity[:, 0], 0), 0)
-        hit = jnp.where(gain > 0, approach / jnp.where(gain > 0, gain, 1), jnp.where(approach > 0, jnp.inf, 0))
+        none = jnp.where(approach > 0, jnp.inf, 0)
+        hit = jnp.where(gain > 0, approach / jnp.asarray(jnp.where(gain > 0, gain, 1)), none)
         hardest = jnp.max(jnp.where(together, hit, 0), axis=1, initial=0)
         return jnp.where(jax.lax.stop_gradient(hardest > slow), contacts.restitution, 0)
 
