@@ -98,7 +98,9 @@ class Case(NamedTuple):
 def _case(numbers: Numbers, bodies, centers, **parts) -> Case:
     motions = [numbers.motion(body, center) for body, center in zip(bodies, centers, strict=True)]
     x, v = (np.concatenate(part) for part in zip(*motions, strict=True))
-    return Case(carom.System(bodies=bodies, dim=len(centers[0]), **parts), x, v)
+    # What is tested are the paper's two convex programs and its target velocity.
+    laws = {"contact_model": "cm", "compensation": "paper"}
+    return Case(carom.System(bodies=bodies, dim=len(centers[0]), **laws, **parts), x, v)
 
 
 def three_disks(numbers: Numbers) -> Case:
