@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import anywhere
-from carom.contact.candidates import Candidates
 from carom.contact.energy import dissipative, islands
 from carom.contact.impulses import ContactState, Jump
 from carom.contact.penetration import pushes
@@ -70,7 +69,7 @@ class _Segment(NamedTuple):
     pressing: Float[Array, "C d"]  # N, of contacts that last, each in its frame
     lasts: Bool[Array, " C"]
     closed: Bool[Array, " C"]
-    gain: Float[Array, " C"]  # m/s, what the accelerations give contacts in a whole step, at most
+    gain: Float[Array, " C"]  # m/s, what the bodies' accelerations give contacts along the normal in a whole step
     push: Float[Array, " n"]  # m/s^2, of the points without contact, at the start
     again: Bool[Array, ""]  # the step has been cut here: there is more of it
     contact: Bool[Array, ""]
@@ -198,27 +197,27 @@ class _Stepping:
 
         def seen(x, v):
             candidates = self.system.candidates(x)
-            return jnp.einsum("cipj,cpj->ci", candidates.rows, v[candidates.stencil]), candidates
+            # Which points of a stencil are of one body: two or three bodies are in it.
+            body = _body_of_point(self.system)[candidates.stencil]
+            which = np.array([np.unique(row, return_inverse=True)[1].reshape(-1) for row in body])
+            mine = np.eye(which.max() + 1)[which].astype(x.dtype)
+            return jnp.einsum("cipj,cpj,cpb->cbi", candidates.rows, v[candidates.stencil], mine), candidates.gap
 
-        (velocity, candidates), (change, _) = jax.jvp(seen, (state.x, state.v), motion)
-        size = jax.lax.stop_gradient(jnp.linalg.norm(motion[1], axis=-1))
-        gain = self.stepper.dt * jax.lax.stop_gradient(self.accelerations(candidates, motion[1]))
-        normal, gap = jax.lax.stop_gradient((velocity[:, 0], candidates.gap))
+        (by_body, gap), (changes, _) = jax.jvp(seen, (state.x, state.v), motion)
+        # Added up as if all bodies were against each other: what falls together may be held apart.
+        steps = self.stepper.dt * jax.lax.stop_gradient(changes)
+        gain = jnp.sum(jnp.linalg.norm(steps, axis=-1), axis=1)
+        normal, gap = jax.lax.stop_gradient((jnp.sum(by_body[..., 0], axis=1), gap))
         lasts = (gap <= _NEAR * left * gain) & (normal >= -_CLOSING * gain) & (normal <= _LEAVING * gain)
         if not has_impulses(self.system, state.x, state.v, self.stepper):
             lasts = jnp.zeros_like(lasts)
-        return state._replace(lasts=lasts, closed=lasts, gain=gain, push=size), change * left
-
-    def accelerations(self, candidates: Candidates, a: Float[Array, "n d"]) -> Float[Array, " C"]:
-        """How the bodies of each candidate are accelerated there (m/s^2), added up as if all were against each other.
-
-        Of material points, so that no body axes are in it, nor a direction of contact.
-        """
-        body = _body_of_point(self.system)[candidates.stencil]
-        which = np.array([np.unique(row, return_inverse=True)[1].reshape(-1) for row in body])
-        mine = np.eye(which.max() + 1)[which].astype(a.dtype)  # (C, P, bodies of one)
-        material = jnp.einsum("cipj,cpj,cpb->cbi", candidates.rows, a[candidates.stencil], mine)
-        return jnp.sum(jnp.linalg.norm(material, axis=-1), axis=1)
+        state = state._replace(
+            lasts=lasts,
+            closed=lasts,
+            gain=jnp.sum(jnp.abs(steps[..., 0]), axis=1),
+            push=jax.lax.stop_gradient(jnp.linalg.norm(motion[1], axis=-1)),
+        )
+        return state, left * jnp.sum(changes, axis=1)
 
     def act(
         self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""], count: Int[Array, ""]
