@@ -241,8 +241,8 @@ class _Stepping:
             free = free.at[:, 0].add(jnp.where(held, room, 0))
         together = islands(contacts.delassus, d)
         reference = jnp.maximum(jnp.abs(free), jnp.abs(before))
-        slow = jnp.minimum(_REBOUNDS[stepper.impact] * jnp.asarray(2.0, before.dtype) ** (count / 2), 1.0)
-        rebounds = self.rebounds(contacts, before, state.gain[index], slow.astype(before.dtype), together)
+        slow = jnp.minimum(_REBOUNDS[stepper.impact] * jnp.exp2(count.astype(before.dtype) / 2), 1.0)
+        rebounds = self.rebounds(contacts, before, state.gain[index], slow, together)
 
         class Acting(NamedTuple):
             velocity: Float[Array, "K d"]  # of the contacts
