@@ -13,6 +13,10 @@ from carom.mechanics.bodies import embed_pose, embed_velocity
 
 GRAVITY = 9.81
 
+PAPER = {"contact_model": "cm", "compensation": "paper"}
+"""The paper's rules, which the tests of these systems have their closed forms from; tests/test_lasting_contact.py has the
+others."""
+
 
 @contextlib.contextmanager
 def refused(message: str):
@@ -37,6 +41,7 @@ def ball_on_floor(*, friction=0.0, restitution=0.0, gravity=GRAVITY, mass=1.0, r
         potential=carom.Gravity((0.0, -gravity)),
         friction=friction,
         restitution=restitution,
+        **PAPER,
     )
 
 
@@ -58,6 +63,7 @@ def round_body_on_floor(dim: int, *, friction=0.0, restitution=0.0, mass=1.0, ra
         contacts=[carom.DiskPlane([0], jnp.zeros(dim), up)],
         friction=friction,
         restitution=restitution,
+        **PAPER,
     )
 
 
@@ -69,6 +75,7 @@ def two_bodies(*, friction=0.0, restitution=1.0, masses=(1.0, 1.0), radii=(0.1, 
         contacts=[carom.DiskDisk([(0, 1)])],
         friction=friction,
         restitution=restitution,
+        **PAPER,
         dim=2,
     )
 

@@ -18,7 +18,7 @@ from cone_problems import apply, kkt_residual
 from hypothesis import Phase, given, settings
 from hypothesis.extra import numpy as hnp
 from jaxtyping import Array, Bool, Float, Int
-from systems import disk, sphere
+from systems import PAPER, disk, sphere
 
 import carom
 from carom.contact.cone_algebra import ConeSettings
@@ -99,8 +99,7 @@ def _case(numbers: Numbers, bodies, centers, **parts) -> Case:
     motions = [numbers.motion(body, center) for body, center in zip(bodies, centers, strict=True)]
     x, v = (np.concatenate(part) for part in zip(*motions, strict=True))
     # What is tested are the paper's two convex programs and its target velocity.
-    laws = {"contact_model": "cm", "compensation": "paper"}
-    return Case(carom.System(bodies=bodies, dim=len(centers[0]), **laws, **parts), x, v)
+    return Case(carom.System(bodies=bodies, dim=len(centers[0]), **PAPER, **parts), x, v)
 
 
 def three_disks(numbers: Numbers) -> Case:
