@@ -14,8 +14,7 @@ from carom.mechanics.bodies import embed_pose, embed_velocity
 GRAVITY = 9.81
 
 PAPER = {"contact_model": "cm", "compensation": "paper"}
-"""The paper's rules, which the tests of these systems have their closed forms from; tests/test_lasting_contact.py has the
-others."""
+"""The rules of the paper, from which the closed forms here are; test_lasting_contact.py tests the default ones."""
 
 
 @contextlib.contextmanager
