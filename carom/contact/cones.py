@@ -291,7 +291,7 @@ def _friction_scale(x, friction):
     return jnp.concatenate([x[..., :1], x[..., 1:] * friction[..., None]], axis=-1)
 
 
-def _apply(A, x):
+def apply(A, x):
     """`A x` for `x` as (B, K, d)."""
     return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
@@ -319,7 +319,7 @@ def _impulse_jvp(settings, primals, tangents):
     dA, dv, dfriction, dlower, _ = tangents  # `reference` only sets a scale
     solution, out = _batched(settings, True)(*primals)
     f = _friction_scale(out.regular, friction)
-    after = _apply(A, f) + out.diagonal[..., None] * _friction_scale(out.moved, friction) + v
+    after = apply(A, f) + out.diagonal[..., None] * _friction_scale(out.moved, friction) + v
     # What is left of z where a contact sticks is an error, which a singular A would multiply by 1 / delta.
     after = jnp.asarray(jnp.where((out.sticks & (friction > 0))[..., None], 0, after))
     # Where mu = 0 the tangent g is not determined by the problem, and z is the apex of its cone. For a growing mu,
@@ -333,7 +333,7 @@ def _impulse_jvp(settings, primals, tangents):
     boundary = jnp.where(frictionless, norm * dfriction[..., None], 0)
     dSy = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * g], axis=-1)
     dS_after = jnp.concatenate([jnp.zeros_like(g[..., :1]), dfriction[..., None] * tangent], axis=-1)
-    force = _apply(dA, f) + dv + _apply(A, dSy) + out.diagonal[..., None] * dSy
+    force = apply(dA, f) + dv + apply(A, dSy) + out.diagonal[..., None] * dSy
     rhs = -(dS_after + _friction_scale(force, friction))
     rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None] + boundary, rhs[..., 1:]], axis=-1)
     df = dSy + _friction_scale(out.solve(rhs), friction)

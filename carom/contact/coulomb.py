@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
-from carom.contact.cones import solve_cones
+from carom.contact.cone_algebra import dot, matvec
+from carom.contact.cones import apply, solve_cones
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -87,14 +88,6 @@ class _Modes(NamedTuple):
     radius: Float[Array, "K B"]  # of the disc, per unit of mu
 
 
-def _matvec(Q: Array, y: Array) -> Array:
-    return jnp.sum(Q * y.reshape(1, -1, y.shape[-1]), axis=1).reshape(y.shape)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.sum(a * b, axis=1)
-
-
 def _modes(problem: _Problem, y: Float[Array, "K d B"], u: Float[Array, "K d B"], apex: Array | bool = False) -> _Modes:
     """Modes at `y` with the velocities `u`; contacts in `apex` are held by their bound where `y` is next to zero."""
     trial = y[:, 0] - u[:, 0]
@@ -102,7 +95,7 @@ def _modes(problem: _Problem, y: Float[Array, "K d B"], u: Float[Array, "K d B"]
     pressed = jnp.where(closes, trial, problem.lower)
     radius = problem.mu * pressed
     push = y[:, 1:] - problem.rho[:, None] * u[:, 1:]
-    length = jnp.sqrt(_dot(push, push))
+    length = jnp.sqrt(dot(push, push))
     sticks = (length <= radius) & (radius > 0)
     safe = jnp.where(length > 0, length, 1)
     along = push / safe[:, None]
@@ -163,16 +156,16 @@ def _residual(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, " B"]
 
     Unlike `H` of the modes no mode can hide it: an impulse outside of its cone counts.
     """
-    u = _matvec(problem.Q, y) + problem.q
+    u = matvec(problem.Q, y) + problem.q
     modes = _modes(problem, y, u)
     impulse = jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
-    velocity = jnp.maximum(jnp.max(_matvec(jnp.abs(problem.Q), jnp.abs(y)), axis=(0, 1)), 1)
+    velocity = jnp.maximum(jnp.max(matvec(jnp.abs(problem.Q), jnp.abs(y)), axis=(0, 1)), 1)
     scale = jnp.where(modes.closes, velocity, impulse)
     tangent = jnp.where(modes.sticks, velocity, impulse)
     parts = jnp.concatenate([jnp.abs(modes.H[:, :1]) / scale[:, None], jnp.abs(modes.H[:, 1:]) / tangent[:, None]], 1)
     # What keeps to its bound or its cone by H alone may still be pushed through it.
     approach = jnp.where(problem.present, jnp.maximum(-u[:, 0], 0), 0) / velocity
-    outside = jnp.sqrt(_dot(y[:, 1:], y[:, 1:])) - problem.mu * jnp.maximum(y[:, 0], 0)
+    outside = jnp.sqrt(dot(y[:, 1:], y[:, 1:])) - problem.mu * jnp.maximum(y[:, 0], 0)
     beyond = jnp.maximum(jnp.maximum(outside, problem.lower - y[:, 0]), 0) / impulse
     worst = jnp.max(jnp.concatenate([parts, approach[:, None], beyond[:, None]], axis=1), axis=(0, 1))
     return jnp.where(jnp.isfinite(worst), worst, jnp.inf)
@@ -208,7 +201,7 @@ def _newton(problem: _Problem, y: Float[Array, "K d B"], steps: int) -> Float[Ar
     """Newton steps from `y`, each as long as makes `|H|` least of some lengths; the best impulse on the way."""
 
     def merit(y):
-        u = _matvec(problem.Q, y) + problem.q
+        u = matvec(problem.Q, y) + problem.q
         H = _modes(problem, y, u).H
         return jnp.max(jnp.abs(H), axis=(0, 1))
 
@@ -223,7 +216,7 @@ def _newton(problem: _Problem, y: Float[Array, "K d B"], steps: int) -> Float[Ar
 
     def body(path: _Path) -> _Path:
         y = path.y
-        u = _matvec(problem.Q, y) + problem.q
+        u = matvec(problem.Q, y) + problem.q
         modes = _modes(problem, y, u)
         change = _linear_solve(_jacobian(problem, modes), -modes.H)
         change = jnp.where(jnp.isfinite(change), change, 0)
@@ -243,7 +236,7 @@ def _polish(problem: _Problem, soft: _Problem, y: Float[Array, "K d B"]) -> Floa
     """`y` less what the diagonal has changed of the velocities, if that meets the law better."""
 
     def improve(_, y):
-        modes = _modes(problem, y, _matvec(problem.Q, y) + problem.q)
+        modes = _modes(problem, y, matvec(problem.Q, y) + problem.q)
         moved = y + _linear_solve(_jacobian(soft, modes), -modes.H)
         return jnp.where(_residual(problem, moved) < _residual(problem, y), moved, y)
 
@@ -294,7 +287,7 @@ class _Sensitivity(NamedTuple):
 def _sensitivity(problem: _Problem, y: Array, bounded: Array, size: Array, unit: Array) -> _Sensitivity:
     k, d, batch = y.shape
     soft = _softened(problem)
-    u = _matvec(soft.Q, y) + problem.q
+    u = matvec(soft.Q, y) + problem.q
     # A bound of zero holds wherever the impulse is next to zero: the derivative is the one-sided one for a growing
     # bound, whichever side rounding has put the velocity on.
     modes = _modes(soft, y, u, bounded & (problem.lower == 0))
@@ -399,11 +392,6 @@ def _batched(sensitivity: bool):
     return as_one_batch(functools.partial(_solve_batch, sensitivity=sensitivity), "solver of Coulomb's law")
 
 
-def _apply(A, x):
-    """`A x` for `x` as (B, K, d)."""
-    return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
-
-
 @jax.custom_jvp
 def _impulse(A, v, friction, lower, reference) -> CoulombSolution:
     return _batched(False)(A, v, friction, lower, reference)[0]
@@ -420,7 +408,7 @@ def _impulse_jvp(primals, tangents):
     dA, dv, dfriction, dlower, _ = tangents  # `reference` only sets a scale
     solution, out = _batched(True)(*primals)
     f = solution.impulse
-    change = _apply(dA, f) + dv
+    change = apply(dA, f) + dv
     rhs = jnp.einsum("bkij,bkj->bki", out.by_velocity, change)
     rhs = rhs + out.by_friction * dfriction[..., None] + out.by_bound * dlower[..., None]
     batch, k, d = f.shape

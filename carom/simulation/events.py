@@ -5,8 +5,8 @@ is frozen: the derivative of a ball's height after a bounce by its height before
 Han and Brikis, *Differentiable Physics Simulations with Contacts: Do They Have Correct Gradients w.r.t. Position,
 Velocity and Control?*, 2022). Here the time of impact moves with the state.
 
-What cannot be told by events is left to the rule of the step's end: contacts that rest, that close again too soon
-after they have opened, and those that close after the last event that a step may have.
+Contacts that rest, or that close again too soon after they have opened, are no events: they are held over the step, see
+`segments.py`.
 """
 
 from collections.abc import Callable

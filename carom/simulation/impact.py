@@ -213,11 +213,6 @@ def impact_at(
 ) -> StepResult:
     """Let the contacts that are closed at `x` change the velocity."""
     contacts, jump = contact_jump(system, x, v, inverse_mass, stepper)
-    return after_impact(contacts, jump)
-
-
-def after_impact(contacts: ContactState, jump: Jump) -> StepResult:
-    """The state with the velocity changed."""
     active = contacts.active
     return StepResult(
         x=contacts.x,
