@@ -7,6 +7,9 @@ from pathlib import Path
 
 # XLA logs pages about the processor for each program it loads from the cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+# Half of the time to compile, for gradients that take a fifth longer: tests compile more than they compute. Commands
+# that tests start inherit it; the smoke runs of .ci/run do not.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 
 import jax
 import jaxtyping
