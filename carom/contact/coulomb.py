@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
 from carom.contact.cone_algebra import dot, matvec
 from carom.contact.cones import apply, solve_cones
+from carom.contact.least_norm import least_norm
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -35,9 +36,9 @@ from carom.contact.cones import apply, solve_cones
 # sliding) end in it elsewhere. Where they do not, sweeps of projected Gauss-Seidel follow, and steps with a diagonal
 # that is made smaller by and by.
 #
-# Where A is singular the impulse is not unique. A diagonal `delta A_nn` on each contact's own block selects that of
-# least norm, each contact weighted by its own mobility: a norm (an energy) that knows no frame and no unit. A last step
-# takes its effect on the velocities away.
+# Where A is singular the impulse is not unique. A diagonal `delta A_nn` on each contact's own block keeps the steps
+# finite; a last step takes its effect on the velocities away. Of the impulses with the modes that are found the one of
+# least norm is taken (`least_norm.py`): a diagonal alone selects it only to rounding over `delta`.
 
 _DELTA = 1e-9
 _SOLVED = 1e-10
@@ -169,6 +170,12 @@ def _residual(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, " B"]
     beyond = jnp.maximum(jnp.maximum(outside, problem.lower - y[:, 0]), 0) / impulse
     worst = jnp.max(jnp.concatenate([parts, approach[:, None], beyond[:, None]], axis=1), axis=(0, 1))
     return jnp.where(jnp.isfinite(worst), worst, jnp.inf)
+
+
+def _least_norm(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
+    """Of all impulses with the modes at `y` that of least norm, where it obeys the law."""
+    least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
+    return jnp.where(_residual(problem, least) <= _SOLVED, least, y)
 
 
 # --- Sweeps and steps -------------------------------------------------------------------------------------------
@@ -317,7 +324,7 @@ class _Search(NamedTuple):
 
 def _search(problem: _Problem, start: Float[Array, "K d B"], rounds: Int[Array, ""]) -> _Search:
     """Rounds of sweeps and Newton steps from `start`, until every problem is solved."""
-    soft = _softened(problem)
+    soft, start = _softened(problem), _least_norm(problem, start)
 
     def keep_going(search: _Search):
         return (search.round < rounds) & jnp.any(search.residual > _SOLVED)
@@ -333,13 +340,16 @@ def _search(problem: _Problem, start: Float[Array, "K d B"], rounds: Int[Array, 
         # Every other round comes down from a large diagonal, with which there is one solution.
         first = jnp.where(again & (search.round % 2 == 0), 0.1, _DELTA).astype(swept.dtype)
         y, _ = jax.lax.while_loop(lambda state: state[1] > 0.5 * _DELTA, smaller, (swept, first))
-        y = _polish(problem, soft, y)
+        y = _least_norm(problem, _polish(problem, soft, y))
         residual = _residual(problem, y)
         better = (residual < search.residual) & (search.residual > _SOLVED)
         y = jnp.where(better, y, search.y)
         return _Search(swept, y, jnp.where(better, residual, search.residual), search.round + 1)
 
-    return jax.lax.while_loop(keep_going, body, _Search(start, start, _residual(problem, start), jnp.asarray(0)))
+    # What is just between two modes (a contact that sticks with all the friction it has, one that only touches) is seen
+    # as held, whatever rounding says.
+    held = start.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
+    return jax.lax.while_loop(keep_going, body, _Search(held, start, _residual(problem, start), jnp.asarray(0)))
 
 
 def _solve_block(A, v, friction, lower, reference, start, rounds, *, sensitivity: bool):

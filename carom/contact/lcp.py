@@ -31,6 +31,9 @@ from carom.errors import CaromError
 # Elsewhere there is mostly none, and where there is one another start may find it. If none does, the impulse is that
 # of A with a larger diagonal: that problem always has a solution, and the residual tells that it is another's.
 #
+# With friction the problem may have several solutions, and Newton's restitution lets some of them gain energy. Where
+# the first one does, the other starts are tried too, and the solution of least energy among those found is taken.
+#
 # From the impulse found follows each contact's mode: open, sticking, sliding against one direction (a vertex of the
 # pyramid's section), or sliding along an edge of it, between two directions whose velocities tie. With E the projector
 # onto the components whose velocity after the impact is given, and f = S y for those that are free,
@@ -65,6 +68,7 @@ class _Problem(NamedTuple):
 
     A: Float[Array, "n n B"]
     v: Float[Array, "K d B"]  # velocity before, less rebound and target
+    before: Float[Array, "K d B"]  # velocity before
     friction: Float[Array, "K B"]
     present: Bool[Array, "K B"]
 
@@ -80,6 +84,13 @@ def pyramid_directions(d: int, facets: int) -> np.ndarray:
 def _after(problem: _Problem, f: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
     """Velocity after the impact, less rebound and target."""
     return jnp.sum(problem.A * f.reshape(1, -1, f.shape[-1]), axis=1).reshape(f.shape) + problem.v
+
+
+def _energy(problem: _Problem, f: Float[Array, "K d B"]) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
+    """What the impulses add to the energy, and how much they exchange."""
+    change = jnp.sum(problem.A * f.reshape(1, -1, f.shape[-1]), axis=1).reshape(f.shape)
+    added = jnp.sum(f * (problem.before + change / 2), axis=(0, 1))
+    return added, jnp.sum(jnp.abs(f * problem.before), axis=(0, 1))
 
 
 def _along(directions: np.ndarray, x: Float[Array, "K t B"]) -> Float[Array, "K m B"]:
@@ -234,7 +245,7 @@ class _Sensitivity(NamedTuple):
     c: Float[Array, "B K t"]  # df_t / dmu = c f_n before the others respond
 
 
-def _scale(A: Array, v: Array, friction: Array):
+def _scale(A: Array, v: Array, before: Array, friction: Array):
     """Batch last: A (K, d, K, d, B), v (K, d, B), friction (K, B). Also 1 / sqrt(A_nn) and the largest datum."""
     k, d, batch = v.shape
     index = jnp.arange(k)
@@ -245,18 +256,21 @@ def _scale(A: Array, v: Array, friction: Array):
     v = v * size[:, None]
     felt = jnp.concatenate([v[:, :1], v[:, 1:] * jnp.minimum(friction, 1)[:, None]], axis=1)
     unit = jnp.maximum(jnp.max(jnp.abs(felt), axis=(0, 1)), jnp.finfo(v.dtype).tiny ** 0.5)
-    return _Problem(A.reshape(k * d, k * d, batch), v / unit, friction, present), size, unit
+    before = before * size[:, None] / unit
+    return _Problem(A.reshape(k * d, k * d, batch), v / unit, before, friction, present), size, unit
 
 
 class _Found(NamedTuple):
     f: Float[Array, "K d B"]
     residual: Float[Array, " B"]  # of the problem that was solved
+    energy: Float[Array, " B"]  # added by the impulses
+    gains: Bool[Array, " B"]
     modes: _Modes
     diagonal: Float[Array, " B"]  # what that problem's A had more
 
 
 def _find(problem: _Problem, directions: np.ndarray, settings: _Settings) -> _Found:
-    """Lemke's method from several starts, in the end with a diagonal, until all problems are solved."""
+    """Lemke's method from several starts, in the end with a diagonal, until all problems are solved without a gain."""
     k, _, batch = problem.v.shape
     dtype = problem.v.dtype
     starts = np.random.default_rng(0).uniform(1, 2, (settings.starts + 1, 2, k * (len(directions) + 2)))
@@ -265,7 +279,8 @@ def _find(problem: _Problem, directions: np.ndarray, settings: _Settings) -> _Fo
 
     def keep_going(state):
         count, found = state
-        return (count <= settings.starts) & jnp.any(found.residual > settings.solved)
+        again = (found.residual > settings.solved) | (found.gains & (count < settings.starts))
+        return (count <= settings.starts) & jnp.any(again)
 
     def search(state):
         count, found = state
@@ -277,12 +292,16 @@ def _find(problem: _Problem, directions: np.ndarray, settings: _Settings) -> _Fo
         f_t = jnp.einsum("mt,kmb->ktb", jnp.asarray(directions, dtype), z[:, 1:-1])
         new = found._replace(f=jnp.concatenate([z[:, :1], f_t], axis=1), diagonal=jnp.full(batch, diagonal))
         new = jax.lax.fori_loop(0, 2, lambda _, new: _refine(trial, new, directions, settings), new)
+        energy, exchanged = _energy(problem, new.f)
+        new = new._replace(energy=energy, gains=energy > settings.solved * exchanged)
         failed = found.residual > settings.solved
-        return count + 1, jax.tree.map(lambda a, b: jnp.where(failed, a, b), new, found)
+        less = found.gains & (new.residual <= settings.solved) & (energy < found.energy) & (count < settings.starts)
+        return count + 1, jax.tree.map(lambda a, b: jnp.where(failed | less, a, b), new, found)
 
     zero = jnp.zeros_like(problem.v)
     modes = _modes(problem, zero, directions, settings)
-    start = _Found(zero, jnp.full(batch, jnp.inf, dtype), modes, jnp.zeros(batch, dtype))
+    none = jnp.zeros(batch, dtype)
+    start = _Found(zero, none + jnp.inf, none, none > 0, modes, none)
     return jax.lax.while_loop(keep_going, search, (0, start))[1]
 
 
@@ -307,17 +326,18 @@ def _refine(problem: _Problem, found: _Found, directions: np.ndarray, settings: 
     return found._replace(f=jnp.where(better, moved, f), residual=jnp.where(better, new, old), modes=modes)
 
 
-def _solve_block(A: Array, v: Array, friction: Array, *, directions: np.ndarray, sensitivity: bool):
+def _solve_block(A: Array, v: Array, before: Array, friction: Array, *, directions: np.ndarray, sensitivity: bool):
     """Solve one block of problems: batch first in and out, batch last inside."""
     batch, k, d = v.shape
     n = k * d
     settings = _Settings.for_dtype(v.dtype)
     finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction).all(1)
+    finite = finite & jnp.isfinite(before).all((1, 2))
     A = jnp.where(finite[:, None, None], A, 0)
-    v = jnp.where(finite[:, None, None], v, 0)
+    v, before = (jnp.moveaxis(jnp.where(finite[:, None, None], x, 0), 0, -1) for x in (v, before))
     friction = jnp.where(finite[:, None], friction, 0)
     A = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
-    problem, size, unit = _scale(A, jnp.moveaxis(v, 0, -1), friction.T)
+    problem, size, unit = _scale(A, v, before, friction.T)
     found = _find(problem, directions, settings)
     residual = _residual(problem, found.f, directions)
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
@@ -338,7 +358,7 @@ TABLEAU = 2**17
 """Entries of the tableaus of the problems that are solved together, so that they stay in cache."""
 
 
-def _solve_batch(A, v, friction, *, facets: int, sensitivity: bool):
+def _solve_batch(A, v, before, friction, *, facets: int, sensitivity: bool):
     """Solve a batch block by block. Problems without a contact cost nothing and give zeros."""
     batch, k, d = v.shape
     n = k * d
@@ -346,7 +366,7 @@ def _solve_batch(A, v, friction, *, facets: int, sensitivity: bool):
     extra = _Sensitivity(jnp.zeros((batch, n, n), v.dtype), jnp.zeros((batch, k, d - 1), v.dtype))
     out = (LCPSolution(jnp.zeros_like(v), jnp.zeros(batch, v.dtype)), extra if sensitivity else None)
     for size, chosen in by_size(contacts_used(A, k), k):
-        arrays = A[:, : size * d, : size * d], v[:, :size], friction[:, :size]
+        arrays = A[:, : size * d, : size * d], v[:, :size], before[:, :size], friction[:, :size]
         block = min(max(TABLEAU // (size * (len(directions) + 2)) ** 2, 8), 128)
         solve = functools.partial(_solve_block, directions=directions, sensitivity=sensitivity)
         out = solve_chosen(solve, arrays, chosen, block, out)
@@ -359,9 +379,9 @@ def _solver(facets: int, sensitivity: bool):
     return as_one_batch(solve, "complementarity solver")
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _impulse(A, v, friction, facets: int) -> LCPSolution:
-    return _solver(facets, False)(A, v, friction)[0]
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
+def _impulse(A, v, before, friction, facets: int) -> LCPSolution:
+    return _solver(facets, False)(A, v, before, friction)[0]
 
 
 # The derivative. With f = S y, S = E + mu c e_n^T and constant E and c (the modes are locally constant away from
@@ -373,9 +393,9 @@ def _impulse(A, v, friction, facets: int) -> LCPSolution:
 # and jit follow.
 @_impulse.defjvp
 def _impulse_jvp(facets, primals, tangents):
-    A, v, friction = primals
-    dA, dv, dfriction = tangents
-    solution, out = _solver(facets, True)(A, v, friction)
+    A, v, before, friction = primals
+    dA, dv, _, dfriction = tangents  # `before` only chooses among solutions
+    solution, out = _solver(facets, True)(A, v, before, friction)
     f = solution.impulse
     u = dfriction[..., None] * out.c * f[..., :1]
     u = jnp.concatenate([jnp.zeros_like(u[..., :1]), u], axis=-1).reshape(*f.shape[:1], -1)
@@ -403,7 +423,8 @@ def solve_lcp_impulse(
     by up to `cos(pi / facets)`, and depends on the directions of the tangents.
 
     **Returns:** impulses (..., K, d) in N s and each problem's residual. A contact whose normal entry of `A` is zero is
-    padding and gets no impulse. Where impulses are not unique they are some solution. Batch axes and `jax.vmap` both
+    padding and gets no impulse. Where impulses are not unique they are some solution; where the first one found adds
+    energy, the one that adds least among those found from three starts. Batch axes and `jax.vmap` both
     become one batch. The search runs in double precision where that is enabled. Differentiable once, in forward and
     reverse mode; the derivative is finite also where contacts are redundant, at kinks it is a one-sided one, and at
     mu = 0 that for a growing mu.
@@ -421,6 +442,7 @@ def solve_lcp_impulse(
     A, velocity, friction, rebound = (x.astype(work) for x in (A, v, friction, rebound))
     # Friction and restitution only ever see the velocity less what is wanted.
     wanted = jnp.zeros((*batch, k, d - 1), work) if v_tangent_target is None else v_tangent_target.astype(work)
-    velocity = velocity - jnp.concatenate([rebound[..., None], wanted], axis=-1)
-    out = _impulse(A.reshape(-1, k * d, k * d), velocity.reshape(-1, k, d), friction.reshape(-1, k), facets)
+    less = velocity - jnp.concatenate([rebound[..., None], wanted], axis=-1)
+    less, before = (x.reshape(-1, k, d) for x in (less, velocity))
+    out = _impulse(A.reshape(-1, k * d, k * d), less, before, friction.reshape(-1, k), facets)
     return LCPSolution(out.impulse.reshape(v.shape).astype(v.dtype), out.residual.reshape(batch).astype(v.dtype))

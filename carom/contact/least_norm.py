@@ -1,0 +1,154 @@
+r"""Of all impulses that contacts may have with given modes the one of least norm. Arrays only.
+
+Where contacts are redundant (`A` is singular) many impulses `y` within the friction cones do the same. With `u = Q y + q`
+the modes of a solution (which contacts are open, stick, and slide where to) say what the others may be: a convex set `Y`,
+a product over the contacts, and a plane,
+
+    open        y_n = lower, |y_t| <= mu lower
+    sticking    y_n >= lower, |y_t| <= mu y_n,                  u_n = 0, u_t = 0
+    sliding     y_n >= lower, y_t = -mu y_n u_t / |u_t|,        u_n = 0
+
+The one of least norm in both, the projection of zero, is unique. With `Q` and `y` scaled by each contact's mobility the
+norm is an energy, which knows neither frame nor unit; and nothing hangs on how a solution was found.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from carom.contact.cone_algebra import dot
+
+# --- The method -------------------------------------------------------------------------------------------------
+#
+# With E the rows of the plane, E Q = U S V^T and b = -S^-1 U^T E q, the plane is V^T y = b, and the projection is P(V a)
+# where a maximises the concave dual, of which this is the negative, with its gradient:
+#
+#     phi(a) = |z|^2 / 2 - |z - P(z)|^2 / 2 - b a,   z = V a;      phi' = V^T P(z) - b
+#
+# P, the projection onto Y, is piecewise smooth, so that Newton's steps with a shorter one where phi does not fall end
+# in the minimum after a few.
+
+_SINGULAR = 1e-9
+"""Singular values below this share of the largest one are zero."""
+_STILL = 1e-7
+"""Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
+_STEPS = 30
+_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
+_FOUND = 1e-13
+
+
+class _Set(NamedTuple):
+    """`Y` above."""
+
+    mu: Float[Array, "K B"]
+    lower: Float[Array, "K B"]
+    closed: Bool[Array, "K B"]
+    slides: Bool[Array, "K B"]
+    way: Float[Array, "K t B"]  # unit vector against the sliding
+
+
+def _project(allowed: _Set, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K d B"], Float[Array, "K d d B"]]:
+    """`P(z)` and its derivative."""
+    mu, lower, closed, slides, way = allowed
+    normal, tangent = z[:, 0], z[:, 1:]
+    length = jnp.sqrt(dot(tangent, tangent))
+    safe = jnp.where(length > 0, length, 1)
+    toward = jnp.where(slides[:, None], way, tangent / safe[:, None])
+    reach = jnp.where(slides, dot(way, tangent), length)
+    inside = ~slides & (length <= mu * normal)
+    on_cone = (normal + mu * reach) / (1 + mu**2)
+    height = jnp.where(inside, normal, on_cone)
+    rises = closed & (height > lower)
+    height = jnp.where(rises, height, lower)
+    # At the bound there is a disc to be in.
+    free = ~slides & jnp.where(rises, inside, length <= mu * height)
+    y_t = jnp.where(free[:, None], tangent, mu[:, None] * height[:, None] * toward)
+    y = jnp.concatenate([height[:, None], y_t], axis=1)
+    slope = jnp.where(rises, jnp.where(inside, 1, 1 / (1 + mu**2)), 0)
+    by_normal = slope
+    by_tangent = jnp.where(inside, 0, slope * mu)[:, None] * toward  # of the height
+    eye = jnp.eye(tangent.shape[1], dtype=z.dtype)[None, :, :, None]
+    across = eye - toward[:, :, None] * toward[:, None]
+    turning = jnp.where(slides, 0, mu * height / safe)[:, None, None] * across
+    moves = (mu[:, None] * toward)[:, :, None] * by_tangent[:, None] + turning
+    moves = jnp.where(free[:, None, None], eye, moves)
+    lifts = jnp.where(free[:, None], 0, (mu * by_normal)[:, None] * toward)
+    top = jnp.concatenate([by_normal[:, None, None], by_tangent[:, None]], axis=2)
+    return y, jnp.concatenate([top, jnp.concatenate([lifts[:, :, None], moves], axis=2)], axis=1)
+
+
+def least_norm(
+    Q: Float[Array, "n n B"],
+    q: Float[Array, "K d B"],
+    u: Float[Array, "K d B"],
+    y: Float[Array, "K d B"],
+    mu: Float[Array, "K B"],
+    lower: Float[Array, "K B"],
+) -> Float[Array, "K d B"]:
+    """The impulse of least norm with the modes of the solution `y`, after which velocities are `u`.
+
+    All scaled such that the largest velocity is about 1. Where no contacts are redundant, or none is found, it is `y`.
+    """
+    k, d, batch = y.shape
+    if k == 1:
+        return y
+    speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
+    still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
+    slides = speed > still
+    closed = u[:, 0] <= still
+    way = -u[:, 1:] / jnp.where(slides, speed, 1)[:, None]
+    allowed = _Set(mu, lower, closed, slides, way)
+
+    def first(x: Array) -> Array:
+        return jnp.moveaxis(x.reshape(k * d, batch), -1, 0)
+
+    def last(x: Array) -> Array:
+        return jnp.moveaxis(x, 0, -1).reshape(k, d, batch)
+
+    held = jnp.broadcast_to((closed & ~slides & (mu > 0))[:, None], y[:, 1:].shape)
+    rows = first(jnp.concatenate([closed[:, None], held], axis=1))
+    left, values, right = jnp.linalg.svd(rows[..., None] * jnp.moveaxis(Q, -1, 0))
+    counts = values > _SINGULAR * values[:, :1]
+    V = jnp.where(counts[:, None], jnp.swapaxes(right, 1, 2), 0)
+    b = -jnp.einsum("bij,bi->bj", left, jnp.where(rows, first(q), 0)) / jnp.where(counts, values, jnp.inf)
+    singular = jnp.sum(counts, axis=1) < jnp.sum(rows, axis=1)
+    size = jnp.maximum(jnp.max(jnp.abs(b), axis=1), 1)
+
+    def look(a):
+        z = last(jnp.einsum("bij,bj->bi", V, a))
+        P, D = _project(allowed, z)
+        value = jnp.sum(z**2 - (z - P) ** 2, axis=(0, 1)) / 2 - jnp.sum(b * a, axis=1)
+        return value, jnp.einsum("bij,bi->bj", V, first(P)) - b, D
+
+    def missed(slope):
+        return jnp.where(singular, jnp.max(jnp.abs(slope), axis=1) / size, 0)
+
+    def keep_going(state):
+        _, slope, _, step = state
+        return (step < _STEPS) & jnp.any(missed(slope) > _FOUND)
+
+    eye = jnp.eye(k * d, dtype=y.dtype)
+
+    def body(state):
+        a, slope, D, step = state
+        whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(D)
+        whole = jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
+        curvature = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
+        # Flat directions: where all impulses along them are at an edge.
+        curvature = curvature + jnp.where(counts, 1e-10, 1)[:, None] * eye
+        change = -jnp.linalg.solve(curvature, slope[..., None])[..., 0]
+        tried = jnp.stack([a + length * change for length in _LENGTHS])
+        values = jax.vmap(lambda t: look(t)[0])(tried)
+        chosen = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0)
+        # Near the end values differ by rounding alone.
+        chosen = jnp.where(missed(slope) < 1e-6, 0, chosen)
+        a = tried[chosen, jnp.arange(batch)]
+        _, slope, D = look(a)
+        return a, slope, D, step + 1
+
+    _, slope, D = look(b)
+    a, slope, _, _ = jax.lax.while_loop(keep_going, body, (b, slope, D, jnp.asarray(0)))
+    found = _project(allowed, last(jnp.einsum("bij,bj->bi", V, a)))[0]
+    return jnp.where(singular & (missed(slope) < 1e-9), found, y)
