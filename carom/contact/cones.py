@@ -31,6 +31,7 @@ from carom.contact.cone_algebra import (
     scale,
 )
 from carom.contact.interior_point import interior_point
+from carom.contact.least_norm import least_norm
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -114,6 +115,8 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
         out, matrix = _short_way(problem, scales, settings)
     else:
         out = _proximal_point(problem, scales, settings)
+        if settings.smoothing == 0 and v.dtype == jnp.float64:
+            out = _of_least_norm(problem, scales, settings, out)
         matrix = _last_matrix(problem, scales, settings, out) if sensitivity else None
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
     solution = _Internal(
@@ -227,6 +230,23 @@ def _proximal_point(problem: Problem, scales: Scales, settings: ConeSettings) ->
     zero = jnp.asarray(0)
     first = _Solved(start, nothing, nothing, nothing, jnp.full(batch, jnp.inf, problem.q.dtype), zero, zero)
     return jax.lax.while_loop(keep_going, body, first)
+
+
+def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, found: _Solved) -> _Solved:
+    """The same velocities by the impulse of least norm, to rounding: the diagonal selects it to rounding over delta."""
+    k, d, batch = problem.q.shape
+    # From S of the program, with its friction, to a scale for normal and tangents alike.
+    ways = jnp.concatenate([jnp.ones_like(scales.mu)[:, None], jnp.repeat(scales.mu[:, None], d - 1, axis=1)], axis=1)
+    over = jnp.where(ways > 0, 1 / jnp.where(ways > 0, ways, 1), 0).reshape(k * d, batch)
+    eye = jnp.eye(k * d, dtype=over.dtype)[..., None]
+    plain = problem.Q - scales.regularization.reshape(k * d, 1, batch) * eye
+    velocity = (jnp.sum(plain * found.y.reshape(1, k * d, batch), axis=1) * over).reshape(k, d, batch)
+    Q, q = over[:, None] * plain * over, problem.q * over.reshape(k, d, batch)
+    lower = jnp.maximum(problem.lower, 0)
+    least = least_norm(Q, q, velocity + q, ways * found.y, scales.mu, lower, lifts=True) * over.reshape(k, d, batch)
+    residual = residual_of(problem, least, scales.regularization)
+    takes = residual <= jnp.maximum(_wanted(settings), found.residual)
+    return found._replace(y=jnp.where(takes, least, found.y), residual=jnp.where(takes, residual, found.residual))
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------

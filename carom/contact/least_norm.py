@@ -86,10 +86,14 @@ def least_norm(
     y: Float[Array, "K d B"],
     mu: Float[Array, "K B"],
     lower: Float[Array, "K B"],
+    *,
+    lifts: bool = False,
 ) -> Float[Array, "K d B"]:
     """The impulse of least norm with the modes of the solution `y`, after which velocities are `u`.
 
     All scaled such that the largest velocity is about 1. Where no contacts are redundant, or none is found, it is `y`.
+    `lifts`: of the convex programs, where a contact that slides leaves with `u_n = mu |u_t|`; these velocities, which
+    are unique, are kept.
     """
     k, d, batch = y.shape
     if k == 1:
@@ -97,7 +101,7 @@ def least_norm(
     speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
     still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
     slides = speed > still
-    closed = u[:, 0] <= still
+    closed = u[:, 0] - (mu * speed if lifts else 0) <= still
     way = -u[:, 1:] / jnp.where(slides, speed, 1)[:, None]
     allowed = _Set(mu, lower, closed, slides, way)
 
@@ -107,12 +111,13 @@ def least_norm(
     def last(x: Array) -> Array:
         return jnp.moveaxis(x, 0, -1).reshape(k, d, batch)
 
-    held = jnp.broadcast_to((closed & ~slides & (mu > 0))[:, None], y[:, 1:].shape)
+    held = jnp.broadcast_to((closed & (mu > 0) & (lifts | ~slides))[:, None], y[:, 1:].shape)
     rows = first(jnp.concatenate([closed[:, None], held], axis=1))
-    left, values, right = jnp.linalg.svd(rows[..., None] * jnp.moveaxis(Q, -1, 0))
+    wanted = first(jnp.where(slides[:, None] & lifts, u, 0) - q)
+    left, values, right = jnp.linalg.svd(jnp.where(rows[..., None], jnp.moveaxis(Q, -1, 0), 0))
     counts = values > _SINGULAR * values[:, :1]
     V = jnp.where(counts[:, None], jnp.swapaxes(right, 1, 2), 0)
-    b = -jnp.einsum("bij,bi->bj", left, jnp.where(rows, first(q), 0)) / jnp.where(counts, values, jnp.inf)
+    b = jnp.einsum("bij,bi->bj", left, jnp.where(rows, wanted, 0)) / jnp.where(counts, values, jnp.inf)
     singular = jnp.sum(counts, axis=1) < jnp.sum(rows, axis=1)
     size = jnp.maximum(jnp.max(jnp.abs(b), axis=1), 1)
 
