@@ -73,16 +73,16 @@ def property_owners(system: System) -> dict[int, str]:
     for contact in system.contacts:
         for name, index in zip(contact.names(), contact.property_index, strict=True):
             owners.setdefault(index, []).append(name)
-    shown = 3
+    few = 3
     return {
-        p: ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")
+        p: ", ".join(names) if len(names) <= few else f"{names[0]} and {len(names) - 1} more"
         for p, names in sorted(owners.items())
     }
 
 
 def model_quantities(system: System) -> Iterator[Quantity]:
     """What fast impacts lose by `Coulomb`, and the epsilon of `CMr`."""
-    model = system.contact_model
+    model = system.contact_model if system.contacts else None
     if isinstance(model, Coulomb):
         for kind in ("friction_loss", "restitution_loss"):
             label = Label(kind, "", f"all contacts: what fast impacts lose of {kind.removesuffix('_loss')}")

@@ -24,8 +24,14 @@ from carom.learning.body_quantities import (
     radius_quantities,
     with_field,
 )
-from carom.learning.geometry_quantities import plane_quantities
+from carom.learning.geometry_quantities import (
+    anchor_quantities,
+    limit_quantities,
+    plane_quantities,
+    rod_quantities,
+)
 from carom.learning.quantity import Quantity
+from carom.learning.shape_quantities import shape_quantities
 from carom.system import System
 
 FINDERS: tuple[Callable[[System], Iterator[Quantity]], ...] = (
@@ -36,6 +42,10 @@ FINDERS: tuple[Callable[[System], Iterator[Quantity]], ...] = (
     force_quantities,
     radius_quantities,
     plane_quantities,
+    shape_quantities,
+    limit_quantities,
+    rod_quantities,
+    anchor_quantities,
 )
 """A finder yields quantities of one kind, in the order in which they are put into a system."""
 HINTS = {
@@ -190,7 +200,7 @@ def _listed(every: Sequence[Quantity]) -> str:
 
 def _tied(name: str, every: Sequence[Quantity]) -> tuple[Quantity, ...]:
     """All that is tied by a name that ends in `=` or is joined by it."""
-    group = tuple(dict((q.name, q) for part in name.split("=") if part for q in _those(part, every)).values())
+    group = tuple({q.name: q for part in name.split("=") if part for q in _those(part, every)}.values())
     alike = {(q.unit, q.label.log) for q in group}
     require(
         len(alike) == 1,

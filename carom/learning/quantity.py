@@ -101,7 +101,7 @@ class Size(Place):
     def write(self, system, value):
         for path in self.paths:
             old = leaf(system, path)
-            system = with_leaf(system, path, old * (value.astype(old.dtype) / self._size(old)))
+            system = with_leaf(system, path, old * value.astype(old.dtype) / self._size(old))
         return system
 
     def _size(self, array: Float[Array, " d"]) -> Float[Array, ""]:
