@@ -144,7 +144,7 @@ class Learned(eqx.Module):
     def free(self, system: System | None = None) -> Float[Array, " P"]:
         """The free numbers of a system of the skeleton's structure (by default, of itself); of tied ones, the mean."""
         system = self.skeleton if system is None else system
-        return self._vector(sum(q.to_free(q.value(system)) for q in group) / len(group) for group in self.groups)
+        return self._vector(jnp.mean(jnp.stack([q.to_free(q.value(system)) for q in group])) for group in self.groups)
 
     def assemble(self, theta: Float[Array, " P"], skeleton: System | None = None) -> System:
         """The system with these free numbers. `skeleton`: another one of the same structure to put them into."""

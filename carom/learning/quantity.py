@@ -6,7 +6,7 @@ is an array, and everything else is hashable: one compiled program serves them a
 
 import abc
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +20,8 @@ Path = tuple[str | int, ...]
 AXES = "xyz"
 
 
-class Slot(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Slot:
     """One entry of an array. `balanced`: the array's first entry is 1 less the others, as weights of places are."""
 
     path: Path
