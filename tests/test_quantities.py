@@ -237,6 +237,13 @@ def test_bounds_are_reached_exactly_and_left_again(name, bound, inward):
     assert float(quantity.from_free(at + 0.3 * inward)) == pytest.approx(bound + 0.3 * inward)
 
 
+def test_what_is_near_to_a_bound_can_be_tried_there():
+    learned = Learned.chosen(made("cp3"), ["mass:1", "friction", "restitution", "gravity:y"])
+    near = learned.at_bounds(jnp.asarray([0.001, 0.019, 0.985, -9.81]))
+    assert near.tolist() == [0.001, 0.0, 1.0, -9.81]
+    assert learned.at_bounds(jnp.asarray([0.001, 0.021, 0.975, -9.81])).tolist() == [0.001, 0.021, 0.975, -9.81]
+
+
 @functools.cache
 def every_of(name: str):
     return quantities(made(name))

@@ -162,6 +162,11 @@ class Learned(eqx.Module):
         """The nearest free numbers within the bounds."""
         return jnp.clip(theta, self.lower.astype(theta.dtype), self.upper.astype(theta.dtype))
 
+    def at_bounds(self, theta: Float[Array, " P"], share: float = 0.2) -> Float[Array, " P"]:
+        """Free numbers that are nearer to a bound than a `share` of their scale, moved onto it: data seldom tell."""
+        lower, upper, near = (part.astype(theta.dtype) for part in (self.lower, self.upper, share * self.scale))
+        return jnp.where(theta < lower + near, lower, jnp.where(theta > upper - near, upper, theta))
+
     def _vector(self, parts: Iterable[Array]) -> Float[Array, " P"]:
         found = list(parts)
         return jnp.stack(found) if found else jnp.zeros(0, self.skeleton.friction.dtype)
