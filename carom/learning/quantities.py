@@ -89,15 +89,14 @@ class Learned(eqx.Module):
         skeleton = with_field(system)
         every, names = quantities(skeleton), tuple(names)
         fixed = {q.name for pattern in fix for q in _those(pattern, every)}
-        every = tuple(q for q in every if q.name not in fixed)
         tied, owner = [], {}
         for name in (name for name in names if "=" in name):
-            group = _tied(name, every)
+            group = tuple(q for q in _tied(name, every) if q.name not in fixed)
             for quantity in group:
                 require(quantity.name not in owner, f"{quantity.name} is tied twice, by {name!r} too: tie it once.")
                 owner[quantity.name] = len(tied)
             tied.append((name.rstrip("="), group))
-        wanted = {q.name for name in names if "=" not in name for q in _those(name, every)}
+        wanted = {q.name for name in names if "=" not in name for q in _those(name, every)} - fixed
         chosen, seen = [], set()
         for quantity in every:
             number = owner.get(quantity.name)
