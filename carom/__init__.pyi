@@ -30,8 +30,11 @@ from .learning.inspection import Inspection as Inspection
 from .learning.inspection import inspect_recording as inspect_recording
 from .learning.model_file import save_model as save_model
 from .learning.models import NeuralPotential as NeuralPotential
+from .learning.quantities import Learned as Learned
+from .learning.quantities import quantities as quantities
+from .learning.quantity import Quantity as Quantity
 from .learning.refine import IdentifyConfig as IdentifyConfig
-from .learning.tosses import TossConfig as TossConfig
+from .learning.toss_config import TossConfig as TossConfig
 from .learning.tosses import TossReport as TossReport
 from .learning.tosses import learn_tosses as learn_tosses
 from .learning.train import LearnReport as LearnReport

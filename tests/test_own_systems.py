@@ -43,6 +43,7 @@ def _apart(tmp_path, monkeypatch):
         ("system = 3", "it was int"),
         ("import carom\n\nsystem = carom.System(bodies=[])", "other.py, line 3: CaromError: bodies must hold"),
         ("a = (\n", "other.py, line 1: SyntaxError"),
+        (f"{FILE}unknown = 'friction'", "must set `unknown` to a list of names of quantities; it was 'friction'"),
         ("import nothing_of_that_name", "ModuleNotFoundError: No module named 'nothing_of_that_name'"),
     ],
 )
@@ -59,6 +60,12 @@ def test_modules_beside_the_file_can_be_imported(tmp_path):
     (tmp_path / "parts_beside.py").write_text(FILE)
     (tmp_path / "other.py").write_text("from parts_beside import system")
     assert choose("other.py").system.n_points == 1
+
+
+def test_a_file_says_what_is_unknown(tmp_path):
+    (tmp_path / "other.py").write_text(f"{FILE}unknown = ['friction', 'radius:0']")
+    assert choose("other.py").unknown == ("friction", "radius:0")
+    assert choose("mine.py").unknown == ()
 
 
 def test_the_template_makes_a_system_and_no_more(tmp_path):
@@ -113,7 +120,12 @@ def test_check_goes_on_with_a_task_that_carom_does_not_have(capsys, monkeypatch)
     assert "is of 'my-lab', which is no task of carom's. Give --task NAME, or --task FILE.py" in out
     assert "recording.cut(samples)" in out
     command("check", "falling.h5", "--task", "mine.py", "--no-tell")
-    assert "impacts of property 0" in " ".join(capsys.readouterr().out.split())
+    out = " ".join(capsys.readouterr().out.split())
+    assert "impacts of property 0" in out
+    assert "What can be learned" not in out
+    command("check", "falling.h5", "--task", "mine.py", "--no-tell", "--quantities")
+    rows = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if line.count("│") == 5]
+    assert ["restitution:0", "0-wall", "0.7", ""] in [[cell.strip() for cell in row] for row in rows]
     command("check", "falling.h5", "--task", "bounce-once", "--no-tell")
     assert "says that it is of 'my-lab'; it is taken as of 'bounce-once'" in " ".join(capsys.readouterr().out.split())
     assert "is no task of carom's. Give --task NAME" in refused(capsys, "view", "falling.h5")

@@ -21,8 +21,8 @@ from carom.cli.tosses import _warn_if_far_off, nominal_width, touching_height
 from carom.cli.view import View
 from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
 from carom.learning.run import RunFolder
-from carom.learning.toss_parameters import CENTER, read_values, with_values
-from carom.learning.tosses import TossConfig, choose_segments, learn_tosses, predict_tosses, prepared
+from carom.learning.toss_config import CENTER, TossConfig, read_values, toss_quantities, with_values
+from carom.learning.tosses import choose_segments, learn_tosses, predict_tosses, prepared
 from carom.mechanics.bodies import embed_pose, embed_velocity, recover_velocity
 from carom.simulation.poses import poses_of
 
@@ -60,12 +60,13 @@ def tosses(cube_tosses):
 
 @pytest.fixture(scope="module")
 def moved(cube):
-    return with_values(cube, NAMES, jnp.asarray([7e-4, 0.25, 0.25]))
+    return with_values(cube, toss_quantities(cube, NAMES), jnp.asarray([7e-4, 0.25, 0.25]))
 
 
 @pytest.mark.slow
 def test_segments_recover_what_noisy_tosses_were_made_with(cube, tosses, moved):
-    truth = read_values(cube, NAMES)
+    learned = toss_quantities(cube, NAMES)
+    truth = read_values(cube, learned)
     system, report = learn_tosses(moved, tosses, CONFIG, progress=False)
     for name, true in zip(NAMES, truth, strict=True):
         found = report.estimates[name]
@@ -73,7 +74,7 @@ def test_segments_recover_what_noisy_tosses_were_made_with(cube, tosses, moved):
         assert 0 < found.standard_error < 0.1 * max(abs(true), 0.1)
         assert abs(found.value - true) < 5 * found.standard_error  # four sessions alone
         assert abs(found.value - true) < 0.05 * true
-    assert np.allclose(read_values(system, NAMES), [e.value for e in report.estimates.values()])
+    assert np.allclose(read_values(system, learned), [e.value for e in report.estimates.values()])
     assert report.tosses == 60
     start_position, start_rotation = errors_of(moved, tosses)
     assert report.position < 0.3 * start_position
@@ -125,11 +126,27 @@ def test_values_are_read_as_they_were_written(cube):
     system = prepared(cube, TossConfig(learn_of_toss=("restitution_loss", "table_tilt_x", "table_height", "gravity")))
     names = ("restitution_loss", "friction_loss", "table_tilt_x", "table_tilt_y", "table_height", "gravity", *CENTER)
     values = np.array([0.3, 0.1, 0.01, -0.02, 1e-3, 9.7, 1e-3, -2e-3, 6e-3])
-    changed = with_values(system, names, jnp.asarray(values))
+    learned = toss_quantities(system, names)
+    assert [each.name for each in learned] == list(names)
+    changed = with_values(system, learned, jnp.asarray(values))
     assert np.allclose(changed.contacts[0].center, -values[-3:])
-    assert np.allclose(read_values(changed, names), values, rtol=1e-12)
+    assert np.allclose(read_values(changed, learned), values, rtol=1e-12)
     assert np.isclose(jnp.linalg.norm(changed.contacts[0].normal), 1)
-    assert np.allclose(read_values(changed, ("half_width", "inertia")), read_values(cube, ("half_width", "inertia")))
+    others = toss_quantities(system, ("half_width", "inertia"))
+    assert np.allclose(read_values(changed, others), read_values(cube, others))
+
+
+def test_all_of_the_registry_can_be_learned_of_tosses(cube):
+    system = prepared(cube, TossConfig())
+    learned = toss_quantities(system, ("friction", "half_widths", "gravity:z"))
+    names = ["friction", "half_widths:0:x", "half_widths:0:y", "half_widths:0:z", "gravity:z"]
+    assert [each.name for each in learned] == names
+    assert np.allclose(read_values(system, learned), [0.18, 0.0512, 0.0512, 0.0512, -9.61])
+    assert np.allclose([each.step for each in learned], [0.03, *[0.01 * 0.0512] * 3, 0.1])  # 1 % of a length
+    with refused("half_widths:0:x is a part of half_width:0"):
+        toss_quantities(system, ("half_width", "half_widths"))
+    with refused("half_widht"):
+        toss_quantities(system, ("half_widht",))
 
 
 def box_on_two_planes() -> carom.System:
@@ -148,16 +165,18 @@ def box_on_two_planes() -> carom.System:
 
 def test_a_box_keeps_its_proportions_and_a_wall_its_properties():
     box, names = box_on_two_planes(), ("half_width", "inertia", "friction", "restitution")
-    values = read_values(box, names)
+    learned = toss_quantities(box, names)
+    values = read_values(box, learned)
     assert np.allclose(values, [0.035, 4e-4, 0.2, 0.1])  # mean half width, mean moment of inertia, those of the table
-    same = with_values(box, names, jnp.asarray(values))
+    same = with_values(box, learned, jnp.asarray(values))
     assert np.allclose(same.contacts[0].half_widths, (0.06, 0.03, 0.015), rtol=1e-12)
-    changed = with_values(box, names, jnp.asarray([0.07, 8e-4, 0.3, 0.4]))
-    assert np.allclose(changed.contacts[0].half_widths, (0.12, 0.06, 0.03))
+    changed = with_values(box, learned, jnp.asarray([0.07, 8e-4, 0.3, 0.4]))
+    for contact in changed.contacts:  # one box, whatever it meets
+        assert np.allclose(contact.half_widths, (0.12, 0.06, 0.03))
     assert np.allclose(changed.bodies[0].moments, (2e-4, 4e-4, 6e-4))
     assert np.allclose(changed.friction, (0.5, 0.3))
     assert np.allclose(changed.restitution, (0.9, 0.4))
-    assert np.allclose(read_values(changed, names), [0.07, 8e-4, 0.3, 0.4])
+    assert np.allclose(read_values(changed, learned), [0.07, 8e-4, 0.3, 0.4])
 
 
 def test_a_box_is_measured_from_where_its_corners_can_touch():
@@ -173,8 +192,10 @@ def test_a_box_is_measured_from_where_its_corners_can_touch():
 def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
     with refused("one rigid body with a CornerPlane"):
         learn_tosses(ball_on_floor(), tosses, CONFIG, progress=False)
-    with refused("learn_of_toss must name some of half_width"):
-        TossConfig(learn_of_toss=("mass",)).check()  # pyright: ignore[reportArgumentType]
+    with refused("learn_of_toss must name something, such as half_width"):
+        TossConfig(learn_of_toss=()).check()
+    with refused("'mass' is nothing that can be learned of this system"):
+        learn_tosses(cube, tosses, dataclasses.replace(CONFIG, learn_of_toss=("mass",)), progress=False)
     with refused("too few for 3 quantities"):
         short = carom.Recording.of(tosses.x[:1, :12], tosses.v[:1, :12], dt=DT)
         learn_tosses(cube, short, CONFIG, progress=False)
@@ -202,7 +223,7 @@ def test_errors_are_what_was_done_to_the_truth(cube, tosses):
 
 def test_recordings_are_of_the_centre_of_the_box(cube):
     center = np.array([1e-3, -2e-3, 5e-3])
-    system = with_values(cube, CENTER, -jnp.asarray(center))
+    system = with_values(cube, toss_quantities(cube, CENTER), -jnp.asarray(center))
     rotation = jnp.asarray(Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix())
     mass, spin = jnp.array([0.1, 0.2, 0.3]), jnp.array([1.0, -2.0, 3.0])
     x, v = embed_pose(mass, rotation), embed_velocity(rotation, jnp.array([0.5, 0.0, -1.0]), spin)

@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from carom.cli.systems import data_and_system
-from carom.cli.tables import findings_table, told_table
+from carom.cli.tables import findings_table, quantities_table, told_table
 from carom.errors import CaromError
 from carom.learning.identify import MOST_POINTS, identify
 from carom.learning.inspection import inspect_recording
@@ -31,6 +31,8 @@ class Check:
     """Name of the task, or a Python file that sets `system`; by default the task that the file names, if any."""
     no_tell: bool = False
     """Leave out what the data can tell, which takes most of the time."""
+    quantities: bool = False
+    """List everything that can be learned of the system, by the names that it is chosen by."""
 
     def run(self) -> None:
         """Do it."""
@@ -47,6 +49,8 @@ class Check:
         console.print(findings_table(title, findings))
         if word:
             console.print(word, soft_wrap=True, highlight=False)
+        if self.quantities and chosen is not None:
+            console.print(quantities_table(chosen.system))
         if chosen is None:
             console.print("That shows what they say of the system, too.", highlight=False)
         elif not self.no_tell:

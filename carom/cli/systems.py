@@ -19,18 +19,22 @@ from carom.tasks import TASKS, task
 
 VARIABLE = "system"
 """What a Python file calls its system."""
+UNKNOWN = "unknown"
+"""What it calls the names of what is to be learned, if it says them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Chosen:
     """A system that was asked for: `name`, as it was given; `source`, the bytes of its file if it is the user's own.
 
-    Of a user's own the masses, friction and restitution need not be true: they are what the file says.
+    Of a user's own the masses, friction and restitution need not be true: they are what the file says. `unknown`: the
+    names of the quantities that the file says are to be learned, if it does.
     """
 
     name: str
     system: System
     source: bytes | None = None
+    unknown: tuple[str, ...] = ()
 
     @property
     def own(self) -> bool:
@@ -66,17 +70,23 @@ def is_file(name: str) -> bool:
 def choose(name: str) -> Chosen:
     """The system of the task of this name, or of the Python file, which is run.
 
-    **Raises:** `CaromError` for an unknown task, and for a file that is missing, fails, or makes no `System`.
+    **Raises:** `CaromError` for an unknown task, and for a file that is missing, fails, makes no `System`, or has
+    an `unknown` that is no list of names.
     """
     if not is_file(name):
         return Chosen(name, task(name))
     path = Path(name)
     require(path.is_file(), f"task is the file {name!r}, which does not exist. `carom new {path.name}` writes one.")
-    system = _run_file(path).get(VARIABLE)
+    defined = _run_file(path)
+    system, unknown = defined.get(VARIABLE), defined.get(UNKNOWN, ())
     if not isinstance(system, System):
         found = "missing" if system is None else type(system).__name__
         raise CaromError(f"{name} must set `{VARIABLE}` to a carom.System outside of any function; it was {found}.")
-    return Chosen(name, system, path.read_bytes())
+    require(
+        isinstance(unknown, list | tuple) and all(isinstance(each, str) for each in unknown),
+        f"{name} must set `{UNKNOWN}` to a list of names of quantities; it was {unknown!r}.",
+    )
+    return Chosen(name, system, path.read_bytes(), tuple(unknown))
 
 
 def data_and_system(path: Path, name: str) -> tuple[Recording, Chosen | None, str]:

@@ -10,6 +10,7 @@ from carom.contact.impulses import CMr
 from carom.learning.baselines import physical_quantities
 from carom.learning.identify import Estimate, Identification
 from carom.learning.models import mass_ratios
+from carom.learning.quantities import describe
 from carom.simulation.recording_checks import Finding
 from carom.system import System
 
@@ -89,6 +90,18 @@ def findings_table(title: str, findings: Iterable[Finding]) -> Table:
         table.add_column(name)
     for finding in findings:
         table.add_row(*finding)
+    return table
+
+
+def quantities_table(system: System) -> Table:
+    """Everything that can be learned of a system, with the values that it has."""
+    table = Table(title="What can be learned, by name")
+    table.add_column("quantity", no_wrap=True)
+    table.add_column("of")
+    table.add_column("value", justify="right")
+    table.add_column("unit")
+    for row in describe(system):
+        table.add_row(*row)
     return table
 
 

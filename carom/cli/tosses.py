@@ -31,8 +31,8 @@ from carom.learning.protocols import (
     toss_errors,
 )
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
-from carom.learning.toss_parameters import CENTER
-from carom.learning.tosses import COMPENSATION, IMPACT, TossConfig, TossReport, learn_tosses, predict_tosses
+from carom.learning.toss_config import CENTER, TossConfig
+from carom.learning.tosses import COMPENSATION, IMPACT, TossReport, learn_tosses, predict_tosses
 from carom.simulation.recording import Recording
 from carom.system import System
 

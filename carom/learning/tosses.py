@@ -12,7 +12,7 @@ Every evaluation of that search is a line of the run's metrics, from which a run
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,67 +29,21 @@ from carom.learning.progress import LoopProgress
 from carom.learning.protocols import body_points, box_of, box_points, pose_errors
 from carom.learning.robust import Blocks, Solution, solve
 from carom.learning.run import RunFolder
-from carom.learning.toss_parameters import PARAMETERS, PLAIN, Quantity, limits, read_values, with_values
+from carom.learning.toss_config import (
+    LOSSES,
+    TossConfig,
+    TossQuantity,
+    limits,
+    read_values,
+    toss_quantities,
+    with_values,
+)
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Gravity
 from carom.simulation.impact import ImpactRule, Stepper
 from carom.simulation.recording import Recording
 from carom.simulation.rollout import Trajectory, rollout
 from carom.system import System
-
-ContactName = Literal["coulomb", "cm", "cmr", "lcp"]
-LOSSES = {"friction_loss", "restitution_loss", "loss_speed"}
-
-
-@dataclasses.dataclass(frozen=True)
-class TossConfig:
-    """How to learn from recorded tosses."""
-
-    learn_of_toss: tuple[Quantity, ...] = PLAIN
-    """What is learned of a tossed body; all else is taken from the task. half_width is the mean of a box's: it keeps
-    its proportions. Gravity, table height and tilts absorb biases of the recording."""
-    toss_extras: tuple[Quantity, ...] = ()
-    """What is learned besides: friction_loss and restitution_loss are what fast impacts lose of friction and
-    restitution."""
-    toss_contact_model: ContactName | None = "coulomb"
-    """Contact model of the tossed body (None: that of the task)."""
-    horizons: tuple[int, ...] = (8, 16)
-    """Samples that segments around impacts are predicted over, one stage after the other."""
-    segments: int = 1000
-    """Most segments in a stage."""
-    toss_rounds: int = 5
-    """Gauss-Newton steps in each stage."""
-    evaluations: int = 60
-    """Most evaluations of whole tosses at the end; 0: leave it at the segments."""
-    toss_samples: int = 120
-    """Samples of a toss that are fitted at the end: bodies rest after that."""
-    substeps: int = 1
-    """Steps of the simulation in one sample."""
-    toss_seed: int = 0
-    """Seed of which segments are used where there are more."""
-
-    @property
-    def names(self) -> tuple[Quantity, ...]:
-        """All that is learned, each once."""
-        return tuple(dict.fromkeys((*self.learn_of_toss, *self.toss_extras)))
-
-    def check(self) -> None:
-        """Raise `CaromError` for a value that cannot be."""
-        known = get_args(Quantity)
-        for name in ("learn_of_toss", "toss_extras"):
-            unknown = set(getattr(self, name)) - set(known)
-            require(not unknown, f"{name} must name some of {', '.join(known)}; it was {getattr(self, name)}.")
-        require(len(self.names) > 0, f"learn_of_toss must name some of {', '.join(known)}; it was ().")
-        losses = sorted(LOSSES & set(self.names))
-        require(
-            not losses or self.toss_contact_model in ("coulomb", None),
-            f"{', '.join(losses)} belong to the contact model coulomb; toss_contact_model was "
-            f"{self.toss_contact_model!r}.",
-        )
-        for name in ("segments", "toss_rounds", "toss_samples", "substeps"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
-        require(self.evaluations >= 0, f"evaluations must not be negative; it was {self.evaluations}.")
-        require(all(h >= 2 for h in self.horizons), f"horizons must be at least 2 samples; they were {self.horizons}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,30 +120,30 @@ def _predict(system: System, x0, v0, stepper: Stepper, samples: int, substeps: i
 
 
 @eqx.filter_jit
-def _tosses(system, names, values, x0, v0, stepper, samples, substeps):
-    return _predict(with_values(system, names, values), x0, v0, stepper, samples, substeps)
+def _tosses(system, learned, values, x0, v0, stepper, samples, substeps):
+    return _predict(with_values(system, learned, values), x0, v0, stepper, samples, substeps)
 
 
 BATCH = 100
 """Segments that are simulated at once; batches are filled up, so that there is one program whatever their number."""
 
 
-def _segments(system, names, values, x0, v0, end, stepper, samples, substeps):
+def _segments(system, learned, values, x0, v0, end, stepper, samples, substeps):
     """Residuals (S, samples, points, 3) of segments and their derivatives (..., p) by the values."""
     count = len(x0)
     rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1).reshape(-1, BATCH)
     parts = [
-        _segment_batch(system, names, values, x0[r], v0[r], end[r], stepper, samples, substeps)
+        _segment_batch(system, learned, values, x0[r], v0[r], end[r], stepper, samples, substeps)
         for r in jnp.asarray(rows)
     ]
     return (np.concatenate([np.asarray(part) for part in each])[:count] for each in zip(*parts, strict=True))
 
 
 @eqx.filter_jit
-def _segment_batch(system, names, values, x0, v0, end, stepper, samples, substeps):
+def _segment_batch(system, learned, values, x0, v0, end, stepper, samples, substeps):
 
     def residual(values):
-        x = _predict(with_values(system, names, values), x0, v0, stepper, samples, substeps)
+        x = _predict(with_values(system, learned, values), x0, v0, stepper, samples, substeps)
         return x[:, 1:] - end
 
     basis = jnp.eye(len(values))
@@ -249,12 +203,14 @@ DAMPING = 1e-2
 """Curvature added for each quantity, in units of its scale and of errors of 1 mm: what no segment tells stays."""
 
 
-def _stage(system: System, names, values, recording: Recording, horizon: int, config: TossConfig):
+def _stage(
+    system: System, learned: Sequence[TossQuantity], values, recording: Recording, horizon: int, config: TossConfig
+):
     """Gauss-Newton steps over one horizon: new values, and the last solution (in units of the scales)."""
     steps = choose_segments(recording, system, horizon, config.segments, config.toss_seed)
     require(
-        len(steps) >= len(names),
-        f"the recording has {len(steps)} segments of {horizon} samples around impacts, too few for {len(names)} "
+        len(steps) >= len(learned),
+        f"the recording has {len(steps)} segments of {horizon} samples around impacts, too few for {len(learned)} "
         "quantities. Give more tosses, learn less, or use shorter horizons.",
     )
     k, s = steps.T
@@ -263,25 +219,25 @@ def _stage(system: System, names, values, recording: Recording, horizon: int, co
     size = float(jnp.min(box_of(system).half_widths))
     # The axes' ends move by as much as the body's surface does.
     reach = np.concatenate([[1.0], np.full(3, size)])[:, None]
-    scale = np.array([PARAMETERS[name].scale for name in names])
-    lower, upper = limits(names)
+    scale = np.array([each.step for each in learned])
+    lower, upper = limits(learned)
     cluster = k if recording.group is None else np.asarray(recording.group)[k]
     stepper = toss_stepper(recording.dt, config.substeps)
     solution = None
     for _ in range(config.toss_rounds):
         residual, columns = _segments(
-            system, names, jnp.asarray(values), x0, v0, end, stepper, horizon, config.substeps
+            system, learned, jnp.asarray(values), x0, v0, end, stepper, horizon, config.substeps
         )
         residual = np.concatenate([residual[..., :1, :], residual[..., 1:, :] - residual[..., :1, :]], axis=-2) * reach
         first = columns[..., :1, :, :]
         columns = np.concatenate([first, columns[..., 1:, :, :] - first], axis=-3) * reach[..., None] * scale
-        flat = residual.reshape(len(k), -1), columns.reshape(len(k), -1, len(names))
+        flat = residual.reshape(len(k), -1), columns.reshape(len(k), -1, len(learned))
         fine = np.isfinite(flat[0]).all(axis=1) & np.isfinite(flat[1]).all(axis=(1, 2))
         blocks = Blocks(flat[0][fine] / 1e-3, flat[1][fine] / 1e-3, cluster[fine], np.zeros(int(fine.sum()), int))
         solution = solve(
             blocks,
-            DAMPING * np.eye(len(names)),
-            np.zeros(len(names)),
+            DAMPING * np.eye(len(learned)),
+            np.zeros(len(learned)),
             np.maximum((lower - values) / scale, -2.0),
             np.minimum((upper - values) / scale, 2.0),
             redescend=True,
@@ -321,11 +277,12 @@ def learn_tosses(
         "tosses are learned for one rigid body with a CornerPlane contact under Gravity; this system is another.",
     )
     require(recording.x.shape[2:] == (4, 3), f"tosses have 4 points in 3D; the recording has {recording.x.shape[2:]}.")
-    system, names = prepared(skeleton, config), config.names
-    values = read_values(system, names)
+    system = prepared(skeleton, config)
+    learned = toss_quantities(system, config.names)
+    values = read_values(system, learned)
     known = [] if run is None else run.metrics()
     started = time.monotonic() - (known[-1]["seconds"] if known else 0.0)
-    errors, count = np.full(len(names), np.nan), 0
+    errors, count = np.full(len(learned), np.nan), 0
     done = {row["horizon"]: row for row in known if "horizon" in row}
 
     def log(**row: Any) -> None:
@@ -339,38 +296,38 @@ def learn_tosses(
                 row = done[horizon]
                 values, errors, count = np.array(row["values"]), np.array(row["errors"], float), row["segments"]
                 continue
-            values, errors, count = _stage(system, names, values, recording, horizon, config)
+            values, errors, count = _stage(system, learned, values, recording, horizon, config)
             log(horizon=horizon, values=values.tolist(), errors=errors.tolist(), segments=count)
-            shown.update(number, f"segments of {horizon}: " + _named(names, values))
+            shown.update(number, f"segments of {horizon}: " + _named(learned, values))
         before = [row for row in known if "loss" in row]
-        values, made = _search(system, names, values, recording, config, before, log, shown)
-    system = with_values(system, names, jnp.asarray(values))
+        values, made = _search(system, learned, values, recording, config, before, log, shown)
+    system = with_values(system, learned, jnp.asarray(values))
     position, rotation = _whole(system, (), np.zeros(0), recording, config)
     estimates = {
-        name: TossEstimate(float(value), float(error) if np.isfinite(error) else None, PARAMETERS[name].unit)
-        for name, value, error in zip(names, values, errors, strict=True)
+        each.name: TossEstimate(float(value), float(error) if np.isfinite(error) else None, each.quantity.unit)
+        for each, value, error in zip(learned, values, errors, strict=True)
     }
     seconds = time.monotonic() - started
     report = TossReport(estimates, float(position.mean()), float(rotation.mean()), len(position), count, made, seconds)
     return system, report
 
 
-def _whole(system: System, names, values, recording: Recording, config: TossConfig):
+def _whole(system: System, learned, values, recording: Recording, config: TossConfig):
     """Errors of whole tosses from their first states: position (share of the width) and rotation (rad), each (N,)."""
     samples = min(config.toss_samples, recording.x.shape[1] - 1)
     stepper = toss_stepper(recording.dt, config.substeps)
     x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
-    x = np.asarray(_tosses(system, names, jnp.asarray(values), x0, v0, stepper, samples, config.substeps))
+    x = np.asarray(_tosses(system, learned, jnp.asarray(values), x0, v0, stepper, samples, config.substeps))
     position, rotation = pose_errors(x, recording.x[:, : samples + 1], np.minimum(recording.length, samples + 1))
     return position / (2 * float(jnp.min(box_of(system).half_widths))), rotation
 
 
-def _search(system, names, values, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
+def _search(system, learned, values, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
     """Nelder and Mead's search over whole tosses, which repeats what `before` holds without computing it again."""
     if config.evaluations == 0:
         return values, 0
-    scale = np.array([PARAMETERS[name].scale for name in names])
-    lower, upper = limits(names)
+    scale = np.array([each.step for each in learned])
+    lower, upper = limits(learned)
     known = {tuple(row["values"]): row["loss"] for row in before}
     made, best = 0, (np.inf, values)
     base = values.clip(lower, upper)
@@ -381,20 +338,20 @@ def _search(system, names, values, recording, config: TossConfig, before: list[d
         made += 1
         key = tuple(tried.tolist())
         if key not in known:
-            position, rotation = _whole(system, names, tried, recording, config)
+            position, rotation = _whole(system, learned, tried, recording, config)
             # A simulation that ends nowhere is as bad as can be.
             known[key] = float(np.nan_to_num(position, nan=10.0).mean() + np.nan_to_num(rotation, nan=np.pi).mean())
             log(values=tried.tolist(), loss=known[key])
         if known[key] < best[0]:
             best = known[key], tried
-        shown.update(len(config.horizons) + made, f"whole tosses {best[0]:.4f}: " + _named(names, best[1]))
+        shown.update(len(config.horizons) + made, f"whole tosses {best[0]:.4f}: " + _named(learned, best[1]))
         return known[key]
 
-    simplex = np.concatenate([np.zeros((1, len(names))), 0.5 * np.eye(len(names))])
+    simplex = np.concatenate([np.zeros((1, len(learned))), 0.5 * np.eye(len(learned))])
     options = {"maxfev": config.evaluations, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}
-    scipy.optimize.minimize(loss, np.zeros(len(names)), method="Nelder-Mead", options=options)
+    scipy.optimize.minimize(loss, np.zeros(len(learned)), method="Nelder-Mead", options=options)
     return best[1], made
 
 
-def _named(names: Sequence[str], values) -> str:
-    return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
+def _named(learned: Sequence[TossQuantity], values) -> str:
+    return ", ".join(f"{each.name} {value:.4g}" for each, value in zip(learned, values, strict=True))
