@@ -86,7 +86,8 @@ class Observations(NamedTuple):
         x = _left_out(as_states("x", x), seen)
         times = as_times(time, x.shape[:2])
         v = None if v is None else _left_out(as_states("v", v), seen)
-        require(v is None or v.shape == x.shape, f"v must have the shape of x, {x.shape}; it was {np.shape(v)}.")
+        if v is not None:
+            require(v.shape == x.shape, f"v must have the shape of x, {x.shape}; it was {v.shape}.")
         for name, part in (("x", x), ("v", v)):
             bad = np.zeros(1, bool) if part is None else np.isinf(part)
             require(not bad.any(), f"{name} must be finite, or NaN where nothing was seen; {_at(bad)} is infinite.")
@@ -378,7 +379,7 @@ def _names(group: Any, count: int) -> tuple[str, ...]:
     return tuple(name.decode() if isinstance(name, bytes) else str(name) for name in array.tolist())
 
 
-def _at(bad: np.ndarray) -> str:
+def _at(bad: Any) -> str:
     """Where the first bad one is."""
     place = np.argwhere(bad)[0] if bad.any() else []
     return ", ".join(f"{axis} {k}" for axis, k in zip(("trajectory", "sample", "point", "axis"), place, strict=False))

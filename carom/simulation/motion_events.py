@@ -1,0 +1,251 @@
+"""Where recorded motion breaks: velocities jump between two samples, as impacts make them, whatever the forces are.
+
+Nothing is known but positions. Around each interval between two samples of a body two models of the same size are
+compared, over windows of several widths:
+
+    one that breaks     a polynomial of degree q in time, and from the interval on a step and a change of slope
+    one that is smooth  a polynomial of degree q + 2
+
+An impact within the interval at time tau changes velocities by J: after it the motion is off by `J (t - tau)`, which is
+what the step and the slope are for, wherever tau is. The motion breaks where
+
+1. the break explains more than noise does: the squares that it takes away, over the variance of the noise, are beyond
+   what the chi^2 distribution has once in so many intervals;
+2. smoothness does not explain it as well: a strong force bends the motion too, but a polynomial follows that.
+
+The noise is measured on the data, by differences of high order over neighbouring samples, of which the median leaves
+impacts out; where a model leaves more, as any does of curved motion without noise, that is taken in its place. So
+nothing has a unit, and a threshold is a probability. Breaks are found one after the other: windows end at those that
+were found, which are then looked at again, and moved or left out where they explain no more. A single sample that is
+wrong bends the motion twice; where leaving it out explains as much, that is done.
+
+Rotations of rigid bodies are looked at by angle (2D) or quaternion (3D), beside the centre.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import chdtri
+
+from carom.simulation.motion_windows import LEAST, Fits, Series, fit_windows, series_of
+from carom.simulation.observations import Observations
+
+SCALES = ((4, 2), (7, 3), (12, 3), (20, 3))
+"""Windows: samples on each side of an interval, and the degree of the polynomial."""
+RATE = 1e-3
+"""Share of intervals in which noise alone may break the motion, at one scale."""
+CONSISTENT = 1e-3
+"""Share of windows in which noise alone leaves more than is taken for noise."""
+BETTER = 6.0
+"""A smooth model must leave so much more than the broken one, in units of the noise,"""
+CLEARLY = 10.0
+"""and so many times as much, where both leave more than noise."""
+AGREE = 0.05
+"""Share of pairs of windows whose jumps are called different by noise alone."""
+ROUNDS = 12
+NEARBY = 2
+"""By so many intervals a break may be moved when it is looked at again."""
+
+
+class Breaks(NamedTuple):
+    """Where motion breaks, in the order of trajectories and times.
+
+    The velocity of `body` jumps by `jump` (m/s, of its centre) at about `time` (s, give or take `time_error`) between
+    the samples `before` and `after` of `trajectory`; `size`: the jump (and that of its rotation) in units of its error.
+    """
+
+    trajectory: Int[np.ndarray, " B"]
+    body: Int[np.ndarray, " B"]
+    before: Int[np.ndarray, " B"]
+    after: Int[np.ndarray, " B"]
+    time: Float[np.ndarray, " B"]
+    time_error: Float[np.ndarray, " B"]
+    jump: Float[np.ndarray, "B d"]
+    size: Float[np.ndarray, " B"]
+
+
+def motion_breaks(observations: Observations, bodies: Sequence[Sequence[int]] | None = None) -> Breaks:
+    """Where the motion of bodies breaks (see the top of this file).
+
+    **Arguments:** `bodies`, the points of each: one, or d + 1 of a rigid body; by default each point is a body.
+    """
+    points = [(k,) for k in range(observations.n_points)] if bodies is None else bodies
+    parts = []
+    for body, own in enumerate(points):
+        series = series_of(observations, own)
+        if series is not None:
+            parts.append(_described(series, _search(series), body))
+    if not parts:
+        none = np.zeros(0, int)
+        return Breaks(none, none, none, none, none * 1.0, none * 1.0, np.zeros((0, observations.dim)), none * 1.0)
+    whole = Breaks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    order = np.lexsort((whole.body, whole.time, whole.trajectory))
+    return Breaks(*(column[order] for column in whole))
+
+
+class Found(NamedTuple):
+    """Breaks of a series: the rows, and the samples `k` after which they are."""
+
+    row: Int[np.ndarray, " B"]
+    k: Int[np.ndarray, " B"]
+
+
+def _search(series: Series) -> Found:
+    """All breaks, one after the other."""
+    breaks: list[list[int]] = [[] for _ in series.count]
+    tried: set[tuple[int, int]] = set()
+    active = np.flatnonzero(series.count >= 2 * LEAST + 1)
+    for _ in range(ROUNDS):
+        row, k = _intervals(series, active, breaks)
+        if not len(row):
+            break
+        score, half = _best(series, row, k, *_limits(series, breaks, row, k))
+        new = [(r, at) for r, at in _peaks(row, k, score, half) if (r, at) not in tried]
+        if not new:
+            break
+        tried.update(new)
+        for r, at in new:
+            breaks[r] = sorted([*breaks[r], at])
+        active = np.array(sorted({r for r, _ in new}))
+        _look_again(series, breaks, active)
+    pairs = [(r, k) for r, own in enumerate(breaks) for k in own]
+    return Found(*np.array(pairs, int).reshape(-1, 2).T)
+
+
+def _intervals(series: Series, rows: Int[np.ndarray, " R"], breaks: list[list[int]]) -> Found:
+    """All intervals of these rows that have enough samples on either side up to the next break."""
+    pairs = []
+    for r in rows:
+        ends = [-1, *breaks[r], series.count[r] - 1]
+        for first, last in itertools.pairwise(ends):
+            pairs += [(r, k) for k in range(first + LEAST, last - LEAST + 1)]
+    return Found(*np.array(pairs, int).reshape(-1, 2).T)
+
+
+def _limits(series: Series, breaks: list[list[int]], row, k) -> tuple[np.ndarray, np.ndarray]:
+    """Between which samples windows around intervals may lie: breaks before and after, but for one at the interval."""
+    low = [max((b + 1 for b in breaks[r] if b < at), default=0) for r, at in zip(row, k, strict=True)]
+    high = [min((b + 1 for b in breaks[r] if b > at), default=series.count[r]) for r, at in zip(row, k, strict=True)]
+    return np.array(low, int), np.array(high, int)
+
+
+def _best(series: Series, row, k, low, high, rate: float = RATE) -> tuple[np.ndarray, np.ndarray]:
+    """How significant a break is at each interval, more than 1 where it is one; and the scale that says so."""
+    best, chosen = np.zeros(len(row)), np.zeros(len(row), int)
+    for scale, (half, degree) in enumerate(SCALES):
+        score = _score(fit_windows(series, row, k, low, high, half, degree), series.free, rate)
+        chosen = np.where(score > best, scale, chosen)
+        best = np.maximum(score, best)
+    return best, chosen
+
+
+def _score(fits: Fits, free: int, rate: float) -> Float[np.ndarray, " S"]:
+    rest = np.maximum(free * fits.dof, 1)
+    spare = np.maximum(1.0, fits.broken / rest)
+    gain = (fits.none - fits.broken) / spare
+    as_noise = fits.broken <= chdtri(rest, CONSISTENT)
+    not_smooth = np.where(as_noise, fits.smooth - fits.broken > BETTER, fits.smooth > CLEARLY * fits.broken)
+    with np.errstate(invalid="ignore"):
+        jump = np.sum((fits.slope / fits.slope_error[:, None]) ** 2, axis=1) / spare
+    good = (fits.dof > 0) & not_smooth & (jump > chdtri(free, rate))
+    return np.where(good, gain / chdtri(2 * free, rate), 0.0)
+
+
+def _peaks(row, k, score, scale) -> list[tuple[int, int]]:
+    """The most significant intervals, none within the window of another."""
+    out: list[tuple[int, int]] = []
+    taken: dict[int, list[tuple[int, int]]] = {}
+    for i in np.argsort(-score, kind="stable"):
+        if score[i] <= 1:
+            break
+        r, at, half = int(row[i]), int(k[i]), SCALES[scale[i]][0]
+        if all(abs(at - other) > max(half, near) for other, near in taken.get(r, [])):
+            taken.setdefault(r, []).append((at, half))
+            out.append((r, at))
+    return out
+
+
+def _look_again(series: Series, breaks: list[list[int]], rows: Int[np.ndarray, " R"]) -> None:
+    """Move breaks of these rows to where they explain most, and leave those out that are none any more."""
+    row = np.array([r for r in rows for _ in breaks[r]], int)
+    k = np.array([b for r in rows for b in breaks[r]], int)
+    low, high = _limits(series, breaks, row, k)
+    _, scale = _best(series, row, k, low, high)
+    moved = _moved(series, row, k, low, high, scale)
+    for r in rows:
+        own = sorted({int(b) for b in moved[row == r]})
+        if len(own) == len(breaks[r]) and all(b - a >= LEAST for a, b in itertools.pairwise(own)):
+            breaks[r] = own
+    k = np.array([b for r in rows for b in breaks[r]], int)
+    score, _ = _best(series, row, k, *_limits(series, breaks, row, k))
+    for r in rows:
+        breaks[r] = [int(b) for b in k[(row == r) & (score > 1)]]
+
+
+def _moved(series: Series, row, k, low, high, scale) -> Int[np.ndarray, " B"]:
+    """The interval nearby in which the motion breaks most likely, of the same samples."""
+    out = k.copy()
+    for s, (half, degree) in enumerate(SCALES):
+        at = np.flatnonzero(scale == s)
+        if not len(at):
+            continue
+        first, end = np.maximum(low[at], k[at] - half + 1), np.minimum(high[at], k[at] + half + 1)
+        costs = []
+        for shift in range(-NEARBY, NEARBY + 1):
+            there = np.clip(k[at] + shift, first + LEAST - 1, end - LEAST - 1)
+            fits = fit_windows(series, row[at], there, first, end, half + NEARBY, degree)
+            cost = np.where(fits.dof > 0, fits.broken + _off(series, row[at], there, fits), np.inf)
+            costs.append(np.where(there == k[at] + shift, cost, np.inf))
+        out[at] = k[at] + np.argmin(costs, axis=0) - NEARBY
+    return out
+
+
+def _off(series: Series, row, k, fits: Fits) -> Float[np.ndarray, " S"]:
+    """How far (chi^2) the step is from what a jump within the interval makes."""
+    late = _late(fits.step, fits.slope, series.time[row, k + 1] - series.time[row, k])
+    with np.errstate(invalid="ignore"):
+        return np.sum((fits.step + fits.slope * late[:, None]) ** 2, axis=1) / fits.step_error**2
+
+
+def _described(series: Series, found: Found, body: int) -> Breaks:
+    """Breaks with their times and jumps.
+
+    Of wide windows, in which errors are small, where a narrow one does not contradict: forces bend motion in those.
+    """
+    breaks: list[list[int]] = [[] for _ in series.count]
+    for r, at in zip(*found, strict=True):
+        breaks[r].append(int(at))
+    low, high = _limits(series, breaks, *found)
+    score, _ = _best(series, *found, low, high)
+    row, k, low, high = (part[score > 1] for part in (*found, low, high))
+    slope, step = (np.zeros((len(row), series.y.shape[2])) for _ in range(2))
+    slope_error, step_error = np.full(len(row), np.inf), np.full(len(row), np.inf)
+    for half, degree in SCALES:
+        fits = fit_windows(series, row, k, low, high, half, degree)
+        spare = np.sqrt(np.maximum(1.0, fits.broken / np.maximum(series.free * fits.dof, 1)))
+        error = spare * fits.slope_error
+        with np.errstate(invalid="ignore"):
+            apart = np.sum((fits.slope - slope) ** 2, axis=1) / (error**2 + slope_error**2)
+        first = np.isinf(slope_error)
+        taken = (_score(fits, series.free, RATE) > 1) & (
+            first | ((apart < chdtri(series.free, AGREE)) & (error < slope_error))
+        )
+        slope, step = (np.where(taken[:, None], new, old) for new, old in ((fits.slope, slope), (fits.step, step)))
+        slope_error = np.where(taken, error, slope_error)
+        step_error = np.where(taken, spare * fits.step_error, step_error)
+    before, after = series.time[row, k], series.time[row, k + 1]
+    length = np.linalg.norm(slope, axis=1)
+    time = (before + after) / 2 + _late(step, slope, after - before)
+    error = np.minimum(step_error / length, (after - before) / np.sqrt(12))
+    samples = series.sample[row, k], series.sample[row, k + 1]
+    jump = slope[:, : len(series.unit)] * series.unit
+    return Breaks(row, np.full(len(row), body), *samples, time, error, jump, length / slope_error)
+
+
+def _late(step: Float[np.ndarray, "S c"], slope: Float[np.ndarray, "S c"], width: Float[np.ndarray, " S"]):
+    """How long after the middle of an interval of this width (s) a jump of this slope makes a step nearest to this."""
+    late = -np.sum(step * slope, axis=1) / np.maximum(np.sum(slope**2, axis=1), 1e-300)
+    return np.clip(late, -width / 2, width / 2)
