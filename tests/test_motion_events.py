@@ -12,7 +12,7 @@ def observed(time, x) -> Observations:
 
 
 def kinked(time, tau, jump, rng, forces: float = 0.0) -> np.ndarray:
-    """Points (N, T, 1, 2) that move evenly, but for a smooth force, and jump by `jump` (m/s) along x at `tau` (N, 1)."""
+    """Points (N, T, 1, 2) that move evenly, but for a smooth force, and jump by `jump` (m/s) along x at `tau`."""
     v, phase = rng.normal(size=(len(tau), 1, 2)), rng.uniform(0, 6, (len(tau), 1, 2))
     x = v * time[..., None] + forces * np.sin(7 * time[..., None] + phase)
     x[..., 0] += jump * np.maximum(time - tau, 0)
