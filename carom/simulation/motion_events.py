@@ -45,6 +45,8 @@ CLEARLY = 10.0
 """and so many times as much, where both leave more than noise."""
 AGREE = 0.05
 """Share of pairs of windows whose jumps are called different by noise alone."""
+QUIETER = 0.9
+"""Where the noise is found to be smaller by so much without the breaks, they are looked for again."""
 ROUNDS = 12
 NEARBY = 2
 """By so many intervals a break may be moved when it is looked at again."""
@@ -76,8 +78,13 @@ def motion_breaks(observations: Observations, bodies: Sequence[Sequence[int]] | 
     parts = []
     for body, own in enumerate(points):
         series = series_of(observations, own)
-        if series is not None:
-            parts.append(_described(series, _search(series), body))
+        if series is None:
+            continue
+        found = _search(series)
+        again = series_of(observations, own, _pieces(series, found))
+        if again is not None and bool((again.unit < QUIETER * series.unit).any()):
+            series, found = again, _search(again)
+        parts.append(_described(series, found, body))
     if not parts:
         none = np.zeros(0, int)
         return Breaks(none, none, none, none, none * 1.0, none * 1.0, np.zeros((0, observations.dim)), none * 1.0)
@@ -91,6 +98,13 @@ class Found(NamedTuple):
 
     row: Int[np.ndarray, " B"]
     k: Int[np.ndarray, " B"]
+
+
+def _pieces(series: Series, found: Found) -> Int[np.ndarray, "N M"]:
+    """In which piece of its motion, from one break to the next, each sample is."""
+    breaks = np.zeros(series.time.shape, int)
+    breaks[found.row, found.k + 1] = 1
+    return np.cumsum(breaks, axis=1)
 
 
 def _search(series: Series) -> Found:
@@ -241,7 +255,7 @@ def _described(series: Series, found: Found, body: int) -> Breaks:
     time = (before + after) / 2 + _late(step, slope, after - before)
     error = np.minimum(step_error / length, (after - before) / np.sqrt(12))
     samples = series.sample[row, k], series.sample[row, k + 1]
-    jump = slope[:, : len(series.unit)] * series.unit
+    jump = slope[:, : series.unit.shape[1]] * series.unit[row]
     return Breaks(row, np.full(len(row), body), *samples, time, error, jump, length / slope_error)
 
 

@@ -17,6 +17,8 @@ LEAST = 2
 """Fewer samples between two breaks tell no velocity."""
 ORDERS = (4, 5, 6, 7)
 """Of differences from which the noise is measured: what is smooth vanishes from higher ones, impacts from lower."""
+ENOUGH = 200
+"""Samples from which the noise of a session is measured."""
 ROUNDING = 16 * np.finfo(float).eps
 """Of numbers, as a share of the largest, by arithmetic: no noise is taken to be smaller."""
 
@@ -33,7 +35,7 @@ class Series(NamedTuple):
     count: Int[np.ndarray, " N"]
     sample: Int[np.ndarray, "N M"]
     free: int
-    unit: Float[np.ndarray, " d"]
+    unit: Float[np.ndarray, "N d"]
 
 
 class Fits(NamedTuple):
@@ -96,8 +98,13 @@ def fit_windows(
     )
 
 
-def series_of(observations: Observations, points: Sequence[int]) -> Series | None:
-    """The motion of the body with these points, one or d + 1; None where too little was seen to know its noise."""
+def series_of(
+    observations: Observations, points: Sequence[int], piece: Int[np.ndarray, "N M"] | None = None
+) -> Series | None:
+    """The motion of the body with these points, one or d + 1; None where too little was seen to know its noise.
+
+    **Arguments:** `piece`, a number for each sample that was seen; of those with one the noise is measured.
+    """
     x, dim = observations.x[:, :, list(points)], observations.dim
     seen: Bool[np.ndarray, "N T"] = observations.seen[:, :, list(points)].all(axis=2)
     sample = np.argsort(~seen, axis=1, kind="stable")
@@ -114,14 +121,34 @@ def series_of(observations: Observations, points: Sequence[int]) -> Series | Non
     if len(points) > 1:
         parts.append(_turns(x, valid))
         free += 1 if dim == 2 else 3
-    units = [
-        np.array([_noise(time, part[..., k], valid, recorded=part is parts[0]) for k in range(part.shape[2])])
-        for part in parts
-    ]
+    session = np.zeros(len(x), int)
+    if observations.group is not None:
+        session = np.unique(observations.group, return_inverse=True)[1]
+    piece = np.zeros(time.shape, int) if piece is None else piece
+    units = [_units(time, part, valid, piece, session, recorded=part is parts[0]) for part in parts]
     if len(points) > 1 and dim == 3:  # errors of a quaternion have three directions of its four
-        units[1] = np.full(4, np.sqrt(np.sum(units[1] ** 2) / 3))
-    y = np.concatenate([part / unit for part, unit in zip(parts, units, strict=True)], axis=2)
+        units[1] = np.repeat(np.sqrt(np.sum(units[1] ** 2, axis=1, keepdims=True) / 3), 4, axis=1)
+    y = np.concatenate([part / unit[:, None] for part, unit in zip(parts, units, strict=True)], axis=2)
     return Series(time, y, count, sample, free, units[0])
+
+
+def _units(
+    time: Float[np.ndarray, "N M"],
+    part: Float[np.ndarray, "N M c"],
+    valid: Bool[np.ndarray, "N M"],
+    piece: Int[np.ndarray, "N M"],
+    session: Int[np.ndarray, " N"],
+    recorded: bool,
+) -> Float[np.ndarray, "N c"]:
+    """The noise of each coordinate, by session where that has enough samples to tell: cameras differ."""
+    out = np.empty((len(part), part.shape[2]))
+    for k in range(part.shape[2]):
+        out[:, k] = _noise(time, part[..., k], valid, piece, recorded)
+        for own in np.unique(session) if session.any() else ():
+            rows = session == own
+            if valid[rows].sum() >= ENOUGH:
+                out[rows, k] = _noise(time[rows], part[rows, :, k], valid[rows], piece[rows], recorded)
+    return out
 
 
 def _turns(x: Float[np.ndarray, "N M p d"], valid: Bool[np.ndarray, "N M"]) -> Float[np.ndarray, "N M c"]:
@@ -141,7 +168,11 @@ def _turns(x: Float[np.ndarray, "N M p d"], valid: Bool[np.ndarray, "N M"]) -> F
 
 
 def _noise(
-    time: Float[np.ndarray, "N M"], y: Float[np.ndarray, "N M"], valid: Bool[np.ndarray, "N M"], recorded: bool
+    time: Float[np.ndarray, "N M"],
+    y: Float[np.ndarray, "N M"],
+    valid: Bool[np.ndarray, "N M"],
+    piece: Int[np.ndarray, "N M"],
+    recorded: bool,
 ) -> float:
     """Standard deviation of independent errors of a coordinate, from divided differences of high order.
 
@@ -156,7 +187,7 @@ def _noise(
     found = []
     for order in ORDERS:
         t, part = (np.lib.stride_tricks.sliding_window_view(a, order + 1, axis=1) for a in (time, y))
-        whole = valid[:, order:]
+        whole = valid[:, order:] & (piece[:, order:] == piece[:, :-order])
         t, part = t[whole], part[whole]
         t = (t - t[:, :1]) / np.where(t[:, -1:] > t[:, :1], t[:, -1:] - t[:, :1], 1.0)
         apart = t[:, :, None] - t[:, None] + np.eye(order + 1)

@@ -245,12 +245,18 @@ def save_observations(
         raise CaromError(f"{path}: {error}") from error.__cause__
 
 
+def task_in(path: str | os.PathLike[str]) -> str:
+    """The task that a trajectory file says it is of, or ""."""
+    path = Path(path)
+    return "" if is_pose_file(names_in(path)) else str(read_positions(path).get("task", ""))
+
+
 def _load(path: Path, system: System | None) -> Observations:
     try:
         content = pose_points(path) if is_pose_file(names_in(path)) else read_positions(path)
         found = Observations.checked(**_taken(content))
         if system is not None:
-            _check_points(found, system)
+            check_points(found, system)
     except CaromError as error:
         text = str(error)
         raise CaromError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from error.__cause__
@@ -270,7 +276,7 @@ def _taken(content: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _check_points(found: Observations, system: System) -> None:
+def check_points(found: Observations, system: System) -> None:
     """Raise `CaromError` unless the points are those of the system."""
     own, wanted = (found.n_points, found.dim), (system.n_points, system.dim)
     if own == wanted:

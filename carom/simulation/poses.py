@@ -46,6 +46,7 @@ NAMES = {
 }
 POSE_STEP_TOLERANCE = 1e-3
 """Largest difference of two time steps that count as equal, relative to the step: the clocks of cameras jitter."""
+AS_THEY_ARE = "(`carom import poses --positions-only` keeps what was seen, and when.)"
 UNIT = 0.01
 """Largest difference of a quaternion's length from 1."""
 WINDOW = 3
@@ -101,7 +102,7 @@ class PoseRecording(eqx.Module):
                 f"{name} must have the shape {(*shape, 3)}; it was {part.shape}.",
             )
             bad = ~np.isfinite(part).all(axis=2) & valid
-            require(not bad.any(), f"{name} must be finite; trajectory {_first(bad)} was not.")
+            require(not bad.any(), f"{name} must be finite; trajectory {_first(bad)} was not. {AS_THEY_ARE}")
             parts[name] = _hold_last(part, length)
         size = np.linalg.norm(parts["quaternion"], axis=2)
         bad = (np.abs(size - 1) > UNIT) & valid
@@ -262,7 +263,7 @@ def _time_step(arrays: dict[str, np.ndarray]) -> float:
     if isinstance(found, Irregular):
         raise CaromError(
             f"time must {'increase' if found.back else 'have equal steps'}; that after sample {found.sample} was "
-            f"{found.step:.6g} s, most were {found.typical:.6g} s. Resample to one rate."
+            f"{found.step:.6g} s, most were {found.typical:.6g} s. Resample to one rate. {AS_THEY_ARE}"
         )
     return found.step
 
