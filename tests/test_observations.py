@@ -82,6 +82,25 @@ def test_rounded_times_of_equal_steps_are_put_back_on_them(decimals):
     assert np.abs(np.diff(found, axis=1) - [[1 / 120], [1 / 60]]).max() < 2 * 10.0**-decimals / 90
 
 
+@pytest.mark.parametrize("decimals", [3, 4])
+def test_rounded_times_are_put_back_on_steps_that_have_gaps(decimals):
+    """A camera that drops frames, whose times are written in milliseconds."""
+    rng = np.random.default_rng(0)
+    whole = np.stack([np.arange(200) / 120, 12.3456 + np.arange(200) / 120])
+    kept = np.sort(np.argsort(rng.random((2, 200)), axis=1)[:, :140], axis=1)
+    times = np.take_along_axis(whole, kept, axis=1)
+    found = Observations.checked(np.zeros((2, 140, 1, 2)), np.round(times, decimals)).time
+    off = found - times
+    assert np.abs(off - off.mean(axis=1, keepdims=True)).max() < 2 * 10.0**-decimals / np.sqrt(140)
+    assert np.abs(off).max() < 10.0**-decimals / 2
+
+
+def test_uneven_times_are_not_taken_for_rounded_ones():
+    rng = np.random.default_rng(0)
+    time = np.round(np.arange(120) / 120 + rng.uniform(-2e-3, 2e-3, (20, 120)), 4)[:, rng.random(120) > 0.3]
+    assert np.array_equal(Observations.checked(np.zeros((*time.shape, 1, 2)), time).time, time)
+
+
 def test_other_times_stay_as_they_were_recorded():
     rng = np.random.default_rng(0)
     time = np.round(np.sort(rng.uniform(0, 1, (2, 40)), axis=1), 6)

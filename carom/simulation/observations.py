@@ -16,7 +16,7 @@ has a row of `time` for each trajectory where they have clocks of their own, and
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from carom.checks import require
 from carom.errors import CaromError
-from carom.simulation.clock import Clock, clock_of, digit_of, rounding_of
+from carom.simulation.clock import Clock, clock_of, digit_of, rounding_of, with_gaps
 from carom.simulation.files import names_in, read_positions, write_content
 from carom.simulation.poses import is_pose_file, pose_points
 from carom.simulation.recording import Recording, as_flags, as_groups, as_lengths, as_states, as_times, plain_text
@@ -347,27 +347,28 @@ def _grown(
     if digit is None:
         digit = np.full(times.shape, digit_of(typed, valid))
     rounding = 2 * rounding_of(typed, float(np.abs(held).max()))
-    return _on_steps(held, valid, lambda rows: digit[rows], rounding)
+    return _on_steps(held, valid, np.broadcast_to(digit, times.shape), rounding)
 
 
 def _on_steps(
-    times: Float[np.ndarray, "N T"],
-    valid: Bool[np.ndarray, "N T"],
-    digit: Callable[[slice], Float[np.ndarray, "m T"]],
-    rounding: float,
+    times: Float[np.ndarray, "N T"], valid: Bool[np.ndarray, "N T"], digit: Float[np.ndarray, "N T"], rounding: float
 ) -> Float[np.ndarray, "N T"]:
     """Times on the equal steps that they were rounded from: one step for all, or each its own; others as they are."""
-    every = slice(None)
-    found = clock_of(times, valid, digit=digit(every), rounding=rounding)
-    if isinstance(found, Clock):
-        return found.time
+    found = _one_step(times, valid, digit, rounding)
+    if found is not None:
+        return found
     out = times.copy()
     for k in range(len(times)):
         row = slice(k, k + 1)
-        found = clock_of(times[row], valid[row], digit=digit(row), rounding=rounding)
-        if isinstance(found, Clock):
-            out[row] = found.time
+        found = _one_step(times[row], valid[row], digit[row], rounding)
+        if found is not None:
+            out[row] = found
     return out
+
+
+def _one_step(times, valid, digit, rounding: float) -> Float[np.ndarray, "m T"] | None:
+    found = clock_of(times, valid, digit=digit, rounding=rounding)
+    return found.time if isinstance(found, Clock) else with_gaps(times, valid, digit=digit, rounding=rounding)
 
 
 def _last(good: Bool[np.ndarray, "N T"]) -> Int[np.ndarray, " N"]:
