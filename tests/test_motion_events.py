@@ -116,6 +116,31 @@ def test_two_disks_break_at_once_and_only_then():
     assert (~at).sum() <= 4
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_two_impacts_in_short_succession_are_one_between_the_samples_around_both(noise):
+    """In a corner: first x, then y turns around, with a sample in between."""
+    rng = np.random.default_rng(0)
+    time = np.arange(60) / 100
+    first, second = 0.3033 + 0.01 * rng.uniform(0, 0.6, (20, 1)), 0.3033 + 0.01 * rng.uniform(0.7, 1.6, (20, 1))
+    x = np.stack([time - 1.9 * np.maximum(time - first, 0), 0.7 * time - 1.3 * np.maximum(time - second, 0)], axis=-1)
+    found = motion_breaks(observed(time, x[:, :, None] + noise * rng.normal(size=(20, 60, 1, 2))))
+    assert found.trajectory.tolist() == list(range(20))
+    around = (time[found.before] < first[:, 0]) & (second[:, 0] < time[found.after])
+    # With noise the sample in between may pass for one after both, or before, where one of the two is next to it.
+    assert around.all() if noise == 0 else np.mean(around) > 0.75
+    assert np.all(found.after - found.before <= 3)
+    np.testing.assert_allclose(found.jump, np.tile([-1.9, -1.3], (20, 1)), atol=1e-8 if noise == 0 else 0.1)
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0])
+def test_a_sample_that_is_wrong_is_no_impact(size):
+    rng = np.random.default_rng(0)
+    time = np.arange(60) / 100
+    x = np.broadcast_to(time[:, None], (20, 60, 2)) + 1e-4 * rng.normal(size=(20, 60, 2))
+    x[:, 30] += size
+    assert len(motion_breaks(observed(time, x[:, :, None])).time) == 0
+
+
 def test_a_rigid_body_breaks_where_only_its_rotation_does():
     rng = np.random.default_rng(0)
     time = np.arange(80) / 150

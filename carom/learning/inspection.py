@@ -67,7 +67,7 @@ def inspect_observations(observations: Observations, system: System) -> list[Fin
     """
     check_points(observations, system)
     out = check_observations(observations)
-    whole = observations.seen.all(axis=2)
+    whole = np.asarray(observations.seen.all(axis=2))
     if system.links and whole.any():
         out.append(_constraints(observations.x[whole], system))
     if system.contacts:

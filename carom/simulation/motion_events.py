@@ -17,20 +17,21 @@ The noise is measured on the data, by differences of high order over neighbourin
 impacts out; where a model leaves more, as any does of curved motion without noise, that is taken in its place. So
 nothing has a unit, and a threshold is a probability. Breaks are found one after the other: windows end at those that
 were found, which are then looked at again, and moved or left out where they explain no more. A single sample that is
-wrong bends the motion twice; where leaving it out explains as much, that is done.
+wrong bends the motion twice, and two impacts with a sample or two in between leave nothing to know the motion between
+them by: where no model explains a window, and one does without such samples, they are left out.
 
 Rotations of rigid bodies are looked at by angle (2D) or quaternion (3D), beside the centre.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtri
 
-from carom.simulation.motion_windows import LEAST, Fits, Series, fit_windows, series_of
+from carom.simulation.motion_windows import LEAST, Fits, Series, fit_windows, series_of, without
 from carom.simulation.observations import Observations
 
 SCALES = ((4, 2), (7, 3), (12, 3), (20, 3))
@@ -45,6 +46,14 @@ CLEARLY = 10.0
 """and so many times as much, where both leave more than noise."""
 AGREE = 0.05
 """Share of pairs of windows whose jumps are called different by noise alone."""
+BETWEEN = 3
+"""Fewer samples between two breaks fit any two, wherever these are."""
+GAPS = (2, 3)
+"""How many intervals impacts may share that are seen as one."""
+NARROW = 2
+"""Scales at which such are looked for."""
+UNEXPLAINED = 1e-4
+"""Share of windows of which noise alone leaves so much that no model is said to explain them."""
 QUIETER = 0.9
 """Where the noise is found to be smaller by so much without the breaks, they are looked for again."""
 ROUNDS = 12
@@ -109,9 +118,27 @@ def _pieces(series: Series, found: Found) -> Int[np.ndarray, "N M"]:
 
 def _search(series: Series) -> Found:
     """All breaks, one after the other."""
-    breaks: list[list[int]] = [[] for _ in series.count]
+    breaks: list[list[int]] = [[] for _ in series.length]
+    _find(series, breaks, np.arange(len(breaks)))
+    hidden = _hidden(series, breaks)
+    for r, k, gap in sorted(hidden, reverse=True):
+        without(series, r, k + 1, k + gap)
+    if hidden:
+        rows = np.unique([r for r, _, _ in hidden])
+        for r in rows:
+            breaks[r] = []
+        _find(series, breaks, rows)
+    return _found((r, k) for r, own in enumerate(breaks) for k in own)
+
+
+def _found(pairs: Iterable[tuple[int, int]]) -> Found:
+    both = np.array(list(pairs), int).reshape(-1, 2)
+    return Found(both[:, 0], both[:, 1])
+
+
+def _find(series: Series, breaks: list[list[int]], active: Int[np.ndarray, " R"]) -> None:
+    """Add to `breaks` those of these rows."""
     tried: set[tuple[int, int]] = set()
-    active = np.flatnonzero(series.count >= 2 * LEAST + 1)
     for _ in range(ROUNDS):
         row, k = _intervals(series, active, breaks)
         if not len(row):
@@ -125,24 +152,71 @@ def _search(series: Series) -> Found:
             breaks[r] = sorted([*breaks[r], at])
         active = np.array(sorted({r for r, _ in new}))
         _look_again(series, breaks, active)
-    pairs = [(r, k) for r, own in enumerate(breaks) for k in own]
-    return Found(*np.array(pairs, int).reshape(-1, 2).T)
+
+
+def _hidden(series: Series, breaks: list[list[int]]) -> list[tuple[int, int, int]]:
+    """Rows, samples k and gaps where what lies between k and k + gap is to be left out.
+
+    There no model explains the motion, and one does without these samples: two impacts follow one another so soon that
+    nothing is known of the motion in between, or a sample is wrong.
+    """
+    best: dict[tuple[int, int], tuple[float, int]] = {}
+    row, k = _intervals(series, np.arange(len(breaks)), [[] for _ in breaks])
+    low, high = _limits(series, breaks, row, k, (BETWEEN - 1, max(GAPS) + BETWEEN - 2))
+    shape, usual, lefts = series.time.shape, [], []
+    told = np.ones(shape, bool)  # where a model explains the motion; ends are not looked at
+    told[row, k] = False
+    for half, degree in SCALES[:NARROW]:
+        fits = fit_windows(series, row, k, low, high, half, degree)
+        least = np.where(fits.dof > 0, np.minimum(fits.broken, fits.smooth), np.inf)
+        usual.append(CLEARLY * float(np.median(least[fits.dof > 0])) if (fits.dof > 0).any() else 0.0)
+        told[row, k] |= least <= np.maximum(chdtri(np.maximum(series.free * fits.dof, 1), UNEXPLAINED), usual[-1])
+        lefts.append(np.full(shape, np.inf))
+        lefts[-1][row, k] = least
+    for scale, gap in itertools.product(range(NARROW), GAPS):
+        there = np.minimum(k[None] + np.arange(gap)[:, None], shape[1] - 1)
+        odd = ~told[row, there].any(axis=0) & np.isfinite(lefts[scale][row, there]).all(axis=0)
+        if not odd.any():
+            continue
+        r, at, least = row[odd], k[odd], lefts[scale][row, there].min(axis=0)[odd]
+        wide = fit_windows(series, r, at, low[odd], high[odd], *SCALES[scale], gap)
+        rest = np.maximum(series.free * wide.dof, 1)
+        now = np.where(_score(wide, series.free, RATE) > 1, wide.broken, np.inf)
+        now = np.minimum(now, wide.none) if gap == GAPS[0] else now
+        good = (wide.dof > 0) & (now <= np.maximum(chdtri(rest, CONSISTENT), usual[scale]))
+        gain = np.where(good, least / np.maximum(now, rest), 0.0)
+        for i in np.flatnonzero(gain > CLEARLY):
+            key, own = (int(r[i]), int(at[i])), (float(gain[i]), gap)
+            best[key] = max(own, best.get(key, own))
+    out: list[tuple[int, int, int]] = []
+    for gap, _, r, at in sorted((gap, -gain, r, at) for (r, at), (gain, gap) in best.items()):
+        if all(r != other or abs(at - there) > max(GAPS) + 1 for other, there, _ in out):
+            out.append((r, at, gap))
+    return out
 
 
 def _intervals(series: Series, rows: Int[np.ndarray, " R"], breaks: list[list[int]]) -> Found:
     """All intervals of these rows that have enough samples on either side up to the next break."""
-    pairs = []
-    for r in rows:
-        ends = [-1, *breaks[r], series.count[r] - 1]
+    pairs: list[tuple[int, int]] = []
+    for r in rows.tolist():
+        ends = [-1, *breaks[r], series.length[r] - 1]
         for first, last in itertools.pairwise(ends):
-            pairs += [(r, k) for k in range(first + LEAST, last - LEAST + 1)]
-    return Found(*np.array(pairs, int).reshape(-1, 2).T)
+            begin = first + (BETWEEN if first >= 0 else LEAST)
+            end = last - (BETWEEN if last < series.length[r] - 1 else LEAST)
+            pairs += [(r, k) for k in range(begin, end + 1)]
+    return _found(pairs)
 
 
-def _limits(series: Series, breaks: list[list[int]], row, k) -> tuple[np.ndarray, np.ndarray]:
-    """Between which samples windows around intervals may lie: breaks before and after, but for one at the interval."""
-    low = [max((b + 1 for b in breaks[r] if b < at), default=0) for r, at in zip(row, k, strict=True)]
-    high = [min((b + 1 for b in breaks[r] if b > at), default=series.count[r]) for r, at in zip(row, k, strict=True)]
+def _limits(
+    series: Series, breaks: list[list[int]], row, k, ignored: tuple[int, int] = (0, 0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between which samples windows around intervals may lie: breaks before and after, but for those `ignored`.
+
+    These are as many before and after the interval; one at the interval is always.
+    """
+    pairs, (back, ahead) = list(zip(row, k, strict=True)), ignored
+    low = [max((b + 1 for b in breaks[r] if b < at - back), default=0) for r, at in pairs]
+    high = [min((b + 1 for b in breaks[r] if b > at + ahead), default=series.length[r]) for r, at in pairs]
     return np.array(low, int), np.array(high, int)
 
 
@@ -191,7 +265,7 @@ def _look_again(series: Series, breaks: list[list[int]], rows: Int[np.ndarray, "
     moved = _moved(series, row, k, low, high, scale)
     for r in rows:
         own = sorted({int(b) for b in moved[row == r]})
-        if len(own) == len(breaks[r]) and all(b - a >= LEAST for a, b in itertools.pairwise(own)):
+        if len(own) == len(breaks[r]) and all(b - a >= BETWEEN for a, b in itertools.pairwise(own)):
             breaks[r] = own
     k = np.array([b for r in rows for b in breaks[r]], int)
     score, _ = _best(series, row, k, *_limits(series, breaks, row, k))
@@ -229,7 +303,7 @@ def _described(series: Series, found: Found, body: int) -> Breaks:
 
     Of wide windows, in which errors are small, where a narrow one does not contradict: forces bend motion in those.
     """
-    breaks: list[list[int]] = [[] for _ in series.count]
+    breaks: list[list[int]] = [[] for _ in series.length]
     for r, at in zip(*found, strict=True):
         breaks[r].append(int(at))
     low, high = _limits(series, breaks, *found)

@@ -26,13 +26,13 @@ ROUNDING = 16 * np.finfo(float).eps
 class Series(NamedTuple):
     """A body's motion in samples that were seen, in units of the noise.
 
-    `time` (s) and `y`, with padding; `count` samples each; `sample`: their numbers among all; `free`: how many of the
+    `time` (s) and `y`, with padding; `length` samples each; `sample`: their numbers among all; `free`: how many of the
     coordinates are free (a quaternion has 3 of 4); `unit`: the noise (m) of the first `d` coordinates, the centre.
     """
 
     time: Float[np.ndarray, "N M"]
     y: Float[np.ndarray, "N M c"]
-    count: Int[np.ndarray, " N"]
+    length: Int[np.ndarray, " N"]
     sample: Int[np.ndarray, "N M"]
     free: int
     unit: Float[np.ndarray, "N d"]
@@ -59,13 +59,18 @@ def fit_windows(
     high: Int[np.ndarray, " S"],
     half: int,
     degree: int,
+    gap: int = 1,
 ) -> Fits:
-    """The models at the intervals after samples `k` of rows, in windows of `half` on each side within [low, high)."""
-    at = k[:, None] + np.arange(1 - half, half + 1)
+    """The models at the intervals after samples `k` of rows, in windows of `half` on each side within [low, high).
+
+    `gap`: the interval ends at sample k + gap, and what lies within is not looked at.
+    """
+    around = np.arange(1 - half, half + 1)
+    at = k[:, None] + around + np.where(around > 0, gap - 1, 0)
     inside = (at >= low[:, None]) & (at < high[:, None])
     at = np.clip(at, 0, series.time.shape[1] - 1)
     t = series.time[row[:, None], at]
-    middle = (series.time[row, k] + series.time[row, k + 1]) / 2
+    middle = (series.time[row, k] + series.time[row, np.minimum(k + gap, series.time.shape[1] - 1)]) / 2
     u = np.where(inside, t - middle[:, None], 0.0)
     span = np.maximum(np.abs(u).max(axis=1), 1e-300)
     u = u / span[:, None]
@@ -75,8 +80,8 @@ def fit_windows(
     powers = np.polynomial.legendre.legvander(u, degree + 2) * inside[..., None]
     plain, kink = powers[..., : degree + 1], np.stack([late.astype(float), np.where(late, u, 0.0)], axis=-1)
     # The triangular factor alone tells all: squares of y below its first p rows are what p columns leave.
-    R = np.linalg.qr(np.concatenate([plain, kink, y], axis=2), mode="r")
-    smooth = np.linalg.qr(np.concatenate([powers, y], axis=2), mode="r")[:, degree + 3 :, degree + 3 :]
+    R = _triangle(np.concatenate([plain, kink, y], axis=2))
+    smooth = _triangle(np.concatenate([powers, y], axis=2))[:, degree + 3 :, degree + 3 :]
     s = degree + 1
     step_size, slope_size, mixed = R[:, s, s], R[:, s + 1, s + 1], R[:, s, s + 1]
     sides = np.minimum(late.sum(axis=1), (inside & ~late).sum(axis=1))
@@ -98,6 +103,18 @@ def fit_windows(
     )
 
 
+def _triangle(columns: Float[np.ndarray, "S w p"]) -> Float[np.ndarray, "S r p"]:
+    return np.asarray(np.linalg.qr(columns, mode="r"))
+
+
+def without(series: Series, row: int, first: int, end: int) -> None:
+    """Take the samples [first, end) of a row out of a series, in place."""
+    kept = np.r_[0:first, end : series.time.shape[1], [series.time.shape[1] - 1] * (end - first)]
+    for part in (series.time, series.y, series.sample):
+        part[row] = part[row, kept]
+    series.length[row] -= end - first
+
+
 def series_of(
     observations: Observations, points: Sequence[int], piece: Int[np.ndarray, "N M"] | None = None
 ) -> Series | None:
@@ -106,7 +123,7 @@ def series_of(
     **Arguments:** `piece`, a number for each sample that was seen; of those with one the noise is measured.
     """
     x, dim = observations.x[:, :, list(points)], observations.dim
-    seen: Bool[np.ndarray, "N T"] = observations.seen[:, :, list(points)].all(axis=2)
+    seen = np.asarray(observations.seen[:, :, list(points)].all(axis=2))
     sample = np.argsort(~seen, axis=1, kind="stable")
     count = seen.sum(axis=1)
     most = int(count.max())

@@ -313,14 +313,15 @@ def as_mask(name: str, value: Any) -> Bool[np.ndarray, "..."]:
 
 def _left_out(x: Float[np.ndarray, "N T n d"], seen: Any) -> Float[np.ndarray, "N T n d"]:
     """With NaN for all axes of a point that was not seen, or of which an axis is missing."""
-    kept = np.isfinite(x).all(axis=3) | np.isinf(x).any(axis=3)  # the infinite is reported, with its place
+    # The infinite is kept, and reported with its place.
+    kept = np.asarray(np.isfinite(x).all(axis=3) | np.isinf(x).any(axis=3))
     if seen is not None:
-        flags = as_mask("seen", seen)
+        flags = np.asarray(as_mask("seen", seen))
         require(
             flags.shape in (x.shape[:2], x.shape[:3]),
             f"seen (or mask) must have the shape {x.shape[:2]} or {x.shape[:3]}; it was {flags.shape}.",
         )
-        kept &= flags if flags.ndim == 3 else flags[..., None]
+        kept &= flags.reshape(*flags.shape, *[1] * (3 - flags.ndim))
     return np.where(kept[..., None], x, np.nan)
 
 
