@@ -4,16 +4,20 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 from rich.console import Console
 
-from carom.cli.systems import data_and_system
+from carom.cli.systems import observed_and_system
 from carom.cli.tables import findings_table, quantities_table, told_table
 from carom.errors import CaromError
 from carom.learning.identify import MOST_POINTS, identify
-from carom.learning.inspection import inspect_recording
+from carom.learning.inspection import inspect_observations, inspect_recording
+from carom.simulation.files import load_recording
+from carom.simulation.observation_checks import check_observations
+from carom.simulation.observations import Observations
 from carom.simulation.recording import Recording
-from carom.simulation.recording_checks import check_recording
+from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
 
 
@@ -22,11 +26,12 @@ class Check:
     """Say what recorded data show of a system, and what they can tell, before anything is learned.
 
     Units, time step, velocities, noise, rods and joints, contacts, chunks to learn from; then the standard error that
-    friction, restitution and mass ratios would have. What looks wrong has an advice.
+    friction, restitution and mass ratios would have. What looks wrong has an advice. Files without velocities, with
+    missing samples or uneven times are looked at as they are: impacts are then seen in how the motion bends.
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Trajectory file (.h5, .hdf5, .npz or .csv)."""
+    """Trajectory file (.h5, .hdf5, .npz or .csv), or pose file."""
     task: str = ""
     """Name of the task, or a Python file that sets `system`; by default the task that the file names, if any."""
     no_tell: bool = False
@@ -37,14 +42,14 @@ class Check:
     def run(self) -> None:
         """Do it."""
         console = Console()
-        recording, chosen, word = data_and_system(self.data, self.task)
-        findings = (
-            check_recording(recording) if chosen is None else inspect_recording(recording, chosen.system).findings
-        )
-        seconds = recording.dt * (int(recording.length.max()) - 1)
+        observed, chosen, word = observed_and_system(self.data, self.task)
+        recording, why_not = _recording(self.data)
+        findings = _findings(observed, recording, None if chosen is None else chosen.system)
+        ends = np.nanmax(observed.time, axis=1) - observed.time[:, 0]
+        step = float(np.nanmedian(np.diff(observed.time, axis=1)))
         title = (
-            f"{self.data.name}: {recording.n_trajectories} trajectories of up to {seconds:.3g} s, a sample every "
-            f"{recording.dt:.4g} s, {recording.n_points} points in {recording.dim}D"
+            f"{self.data.name}: {observed.n_trajectories} trajectories of up to {ends.max():.3g} s, a sample every "
+            f"{step:.4g} s, {observed.n_points} points in {observed.dim}D"
         )
         console.print(findings_table(title, findings))
         if word:
@@ -53,7 +58,9 @@ class Check:
             console.print(quantities_table(chosen.system))
         if chosen is None:
             console.print("That shows what they say of the system, too.", highlight=False)
-        elif not self.no_tell:
+        elif not self.no_tell and recording is None:
+            console.print(f"What they can tell cannot be found: {why_not}", soft_wrap=True, highlight=False)
+        elif not self.no_tell and recording is not None:
             self._tell(recording, chosen.system, console)
         advised = sum(bool(finding.advice) for finding in findings)
         console.print(f"{advised} of {len(findings)} checks have an advice." if advised else "Nothing looks wrong.")
@@ -72,3 +79,18 @@ class Check:
             console.print(f"It cannot be found: {error}", highlight=False)
             return
         console.print(told_table(system, found))
+
+
+def _recording(path: Path) -> tuple[Recording | None, str]:
+    """The recording that a file is, with velocities in equal steps; or None, and why it is none."""
+    try:
+        return load_recording(path), ""
+    except CaromError as error:
+        return None, str(error)
+
+
+def _findings(observed: Observations, recording: Recording | None, system: System | None) -> list[Finding]:
+    """Of a recording what it shows; of what is none, or had no velocities, what its positions do."""
+    if recording is None or observed.v is None:
+        return check_observations(observed) if system is None else inspect_observations(observed, system)
+    return check_recording(recording) if system is None else inspect_recording(recording, system).findings

@@ -1,4 +1,4 @@
-"""`carom import`: a recording of poses as a trajectory file, and the public recordings as poses."""
+"""`carom import`: recordings of points or poses as a trajectory file, and the public recordings as poses."""
 
 import dataclasses
 from pathlib import Path
@@ -17,29 +17,38 @@ if TYPE_CHECKING:
     from carom.simulation.poses import PoseRecording
     from carom.simulation.recording_checks import Finding
 
-Kind = Annotated[Literal["poses", "contactnets"], tyro.conf.Positional, tyro.conf.arg(metavar="poses|contactnets")]
-Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+Kind = Annotated[
+    Literal["points", "poses", "contactnets"],
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="points|poses|contactnets"),
+]
+Sources = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
 
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """Turn recorded poses of a tossed body (positions and quaternions, NPZ or HDF5) into a carom trajectory file.
+    """Turn recorded points, or poses of a body (positions and quaternions), into a carom trajectory file.
 
-    Says what looks wrong: scale, gravity, penetration, bias, copies, late velocities. docs/real-data.md has the format.
+    `carom import points FILE...` reads CSV, NPZ and HDF5 files, several at once, with or without velocities, with
+    samples missing and times of any kind, and keeps all that as it was recorded (docs/data.md).
+    `carom import poses FILE` is for a tossed body; it says what looks wrong: scale, gravity, penetration, bias, copies,
+    late velocities (docs/real-data.md), and estimates velocities, but for --positions-only.
     `carom import contactnets FILE.tar.gz` turns the public recordings of a tossed cube into a pose file; the archive is
     downloaded if it is not there.
     """
 
     kind: Kind
     """What the file holds."""
-    file: Source
-    """Pose file, or archive."""
+    files: Sources
+    """Files of points, pose file, or archive."""
     size: float | None = None
-    """Nominal width of the body in m; needed for poses."""
+    """Nominal width of the body in m; needed to check poses."""
     mass: float | None = None
     """Mass in kg, noted in the file; motion under gravity and contact does not depend on it."""
     out: FilePath = None
     """File to write (.h5, .hdf5 or .npz); by default FILE-trajectories.h5, or cube_tosses.npz for contactnets."""
+    positions_only: bool = False
+    """Keep no velocities, and estimate none; times and samples that are missing stay as they are."""
     sha256: str | None = None
     """Checksum that the archive must have."""
     scale: float = 1.0
@@ -52,8 +61,8 @@ class Import:
     """Estimate velocities from poses even if the file has some."""
     keep_copies: bool = False
     """Keep trajectories that the file says are copies of others."""
-    task: str = "cube"
-    """Task that the trajectories are of."""
+    task: str | None = None
+    """Task that the trajectories are of; cube for poses unless it is given."""
 
     def after_interrupt(self) -> str:
         """What to say when interrupted."""
@@ -61,10 +70,46 @@ class Import:
 
     def run(self) -> None:
         """Do it."""
+        require(len(self.files) > 0, "FILE must be named: what is to be imported.")
+        require(
+            self.kind == "points" or len(self.files) == 1,
+            f"{self.kind} must be one FILE; there were {len(self.files)}.",
+        )
+        require(self.scale > 0, f"--scale must be positive; it was {self.scale}.")
         if self.kind == "contactnets":
             self._convert()
+        elif self.kind == "points" or self.positions_only:
+            self._keep()
         else:
             self._import()
+
+    @property
+    def file(self) -> Path:
+        """The first file, or the only one."""
+        return self.files[0]
+
+    def _keep(self) -> None:
+        """Write what was seen as it was recorded."""
+        from carom.simulation.observations import load_observations, save_observations
+
+        out = self.out or self.file.with_name(f"{self.file.stem}-trajectories.h5")
+        check_writable(out)
+        found = load_observations(self.files)
+        require(
+            self.kind == "points" or found.n_points == 4,
+            f"{self.file}: it holds points, not poses: carom import points.",
+        )
+        v = None if self.positions_only or found.v is None else found.v * self.scale
+        found = found._replace(x=found.x * self.scale, v=v)
+        task = self.task or ("cube" if self.kind == "poses" else "")
+        save_observations(out, found, task=task, source=", ".join(file.name for file in self.files))
+        lost = 1 - found.seen.sum() / (found.valid.sum() * found.n_points)
+        Console().print(
+            f"{found.n_trajectories} trajectories of up to {found.length.max()} samples, {found.n_points} points in "
+            f"{found.dim}D, {'no' if v is None else 'with'} velocities, {lost:.1%} not seen\nWritten to {out}",
+            highlight=False,
+            soft_wrap=True,
+        )
 
     def _convert(self) -> None:
         from carom.simulation import contactnets
@@ -96,7 +141,6 @@ class Import:
             f"--size must be the body's width, a positive length in m; it was {width}. Give --size 0.1 for 10 cm.",
         )
         assert width is not None
-        require(self.scale > 0, f"--scale must be positive; it was {self.scale}.")
         require(self.mass is None or self.mass > 0, f"--mass must be positive, in kg; it was {self.mass}.")
         out = self.out or self.file.with_name(f"{self.file.stem}-trajectories.h5")
         check_writable(out)
@@ -113,7 +157,7 @@ class Import:
             # Differences of the past are half a sample old; what is measured is that, with noise.
             poses = at_samples(poses, 0.5 * poses.dt * round(2 * lag))
         about = f"{self.file.name}, width {width} m" + (f", mass {self.mass} kg" if self.mass else "")
-        save_recording(out, poses.to_recording(task=self.task, source=about))
+        save_recording(out, poses.to_recording(task=self.task or "cube", source=about))
         console = Console()
         table = findings_table(f"{self.file.name}: {len(poses.length)} trajectories at {1 / poses.dt:.0f} Hz", findings)
         table.add_row("noise of heights in flight", f"{flight_noise(poses) * 1e3:.3f} mm", "")

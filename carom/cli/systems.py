@@ -13,6 +13,7 @@ from carom.errors import CaromError
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, SYSTEM, RunFolder
 from carom.simulation.files import load_recording
+from carom.simulation.observations import Observations, load_observations, task_in
 from carom.simulation.recording import Recording
 from carom.system import System
 from carom.tasks import TASKS, task
@@ -95,14 +96,24 @@ def data_and_system(path: Path, name: str) -> tuple[Recording, Chosen | None, st
     **Raises:** `CaromError` if the file cannot be read, or there is no system of the name that was given.
     """
     chosen, recording = choose(name) if name else None, load_recording(path)
-    its = recording.task
+    return recording, *_of_task(path, recording.task, chosen, name)
+
+
+def observed_and_system(path: Path, name: str) -> tuple[Observations, Chosen | None, str]:
+    """As `data_and_system`, of observations: positions suffice, and samples may be missing."""
+    chosen, observations = choose(name) if name else None, load_observations(path)
+    return observations, *_of_task(path, task_in(path), chosen, name)
+
+
+def _of_task(path: Path, its: str, chosen: Chosen | None, name: str) -> tuple[Chosen | None, str]:
+    """The system that was chosen, or that of the task that a file names; and a word where these differ."""
     if chosen is None:
         if its in TASKS:
-            return recording, choose(its), ""
+            return choose(its), ""
         known = f"is of {its!r}, which is no task of carom's" if its else "does not say of which task it is"
-        return recording, None, f"{path} {known}. Give --task NAME, or --task FILE.py that sets `{VARIABLE}`."
+        return None, f"{path} {known}. Give --task NAME, or --task FILE.py that sets `{VARIABLE}`."
     differs = bool(its) and chosen.task not in (None, its)
-    return recording, chosen, f"{path} says that it is of {its!r}; it is taken as of {name!r}." if differs else ""
+    return chosen, f"{path} says that it is of {its!r}; it is taken as of {name!r}." if differs else ""
 
 
 def chosen_by(run: RunFolder) -> Chosen:

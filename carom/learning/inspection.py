@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from carom.contact.limits import BendLimit, StretchLimit
 from carom.learning.config import LearnConfig
@@ -15,6 +15,9 @@ from carom.learning.refine import IdentifyConfig
 from carom.learning.tosses import can_learn_tosses
 from carom.mechanics.constraints import Rigid
 from carom.mechanics.potentials import Gravity
+from carom.simulation.motion_impacts import impact_counts, motion_impacts
+from carom.simulation.observation_checks import check_observations
+from carom.simulation.observations import Observations, check_points
 from carom.simulation.recording import Recording, check_system
 from carom.simulation.recording_checks import Finding, check_recording
 from carom.system import System
@@ -42,10 +45,10 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
     config = LearnConfig() if config is None else config
     out = check_recording(recording)
     if system.links:
-        out.append(_constraints(recording, system))
+        out.append(_constraints(recording.x[recording.valid], system))
     closings = closing(recording, system)
     if system.contacts:
-        out.append(_depth(recording, system))
+        out.append(_depth(recording.x, recording.valid, system))
         out += _meetings(recording, system)
     closed = contact_flags(recording, system) if system.contacts else np.zeros(recording.x.shape[:2], bool)
     more = (_step_length(recording, system), _free_fall(recording, system, closed))
@@ -57,23 +60,49 @@ def inspect_recording(recording: Recording, system: System, config: LearnConfig 
     return Inspection(out, closings.tolist())
 
 
-def _constraints(recording: Recording, system: System) -> Finding:
-    off = np.abs(np.asarray(system.violation(jnp.asarray(recording.x[recording.valid]))))
+def inspect_observations(observations: Observations, system: System) -> list[Finding]:
+    """What positions show, alone and of the geometry of `system`: nothing need be complete, or in equal steps.
+
+    **Raises:** `CaromError` if the observations are of another number of points or dimension.
+    """
+    check_points(observations, system)
+    out = check_observations(observations)
+    whole = np.asarray(observations.seen.all(axis=2))
+    if system.links and whole.any():
+        out.append(_constraints(observations.x[whole], system))
+    if system.contacts:
+        if whole.any():
+            out.append(_depth(observations.x, whole, system))
+        out.append(_impacts(observations, system))
+    return out
+
+
+def _impacts(observations: Observations, system: System) -> Finding:
+    """Impacts that motion shows, wherever bodies overlap."""
+    found = motion_impacts(observations, system)
+    parts = ", ".join(f"{name} {count}" for name, count in impact_counts(found, system).items())
+    enough = len(found) >= IdentifyConfig().min_impacts
+    advice = "" if enough else f"{IdentifyConfig().min_impacts} or more tell friction and restitution"
+    return Finding("impacts seen in the motion", f"{len(found)}{f' ({parts})' if parts else ''}", advice)
+
+
+def _constraints(states: Float[np.ndarray, "S n d"], system: System) -> Finding:
+    off = np.abs(np.asarray(system.violation(jnp.asarray(states))))
     worst = float(off.max(initial=0.0))
     advice = "" if worst <= LOOSE else "lengths of rods, units or the order of points may be wrong"
     advice += "; `learn` refuses it" if worst > LARGEST_DRIFT else ""
     return Finding("rods and joints are off by", f"{worst:.1e} of what they hold, median {np.median(off):.0e}", advice)
 
 
-def _depth(recording: Recording, system: System) -> Finding:
-    """The deepest contact, as a share of the depth at which bodies would be through each other."""
+def _depth(x: Float[np.ndarray, "N T n d"], whole: Bool[np.ndarray, "N T"], system: System) -> Finding:
+    """The deepest contact of whole states, as a share of the depth at which bodies would be through each other."""
     reach, deepest, place, states = np.asarray(system.reach()), 0.0, "", 0
     count = 0
-    for k, (gaps, length) in enumerate(zip(all_gaps(recording.x, system), recording.length, strict=True)):
-        depth = -gaps[:length]
+    for k, (gaps, there) in enumerate(zip(all_gaps(x, system), whole, strict=True)):
+        depth = np.where(there[:, None], -gaps, 0.0)
         states += int((depth > 0).any(axis=1).sum())
         share = np.divide(depth, reach, out=np.zeros_like(depth), where=reach > 0)  # points have none
-        count += int(length)
+        count += int(there.sum())
         if share.max(initial=0.0) > deepest:
             deepest = float(share.max())
             place = f" (trajectory {k}, sample {int(share.max(axis=1).argmax())})"
@@ -82,13 +111,17 @@ def _depth(recording: Recording, system: System) -> Finding:
 
 
 def _meetings(recording: Recording, system: System) -> list[Finding]:
-    """Whether impacts are at the samples; nothing of bodies that never meet. Tosses are learned in either case."""
+    """Whether impacts are at the samples; nothing of bodies that never meet. Tosses are learned in either case.
+
+    Where they are between the samples, the motion shows them.
+    """
     found = meetings(recording, system)
     if not sum(found):
         return []
     steps = found.not_seen and not can_learn_tosses(system)
     advice = "impacts happen between the samples: friction and restitution cannot be learned" if steps else ""
-    return [Finding("where bodies meet", str(found), advice)]
+    out = [Finding("where bodies meet", str(found), advice)]
+    return [*out, _impacts(Observations.of(recording), system)] if found.not_seen else out
 
 
 def _step_length(recording: Recording, system: System) -> Finding | None:

@@ -10,7 +10,7 @@ from decimal import Decimal
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 STEP_TOLERANCE = 1e-6
 """Largest difference of two time steps that count as equal, relative to the step."""
@@ -20,6 +20,10 @@ MANY = 0.1
 """Share of steps that are off, from which on coarse digits are taken for the reason."""
 MOST_DECIMALS = 12
 ROUNDS = 60
+FINE = 0.2
+"""Largest last digit of times with gaps, as a share of the step."""
+MOST_LOST = 50
+"""A longer gap, in steps, does not tell how many samples were lost in it."""
 
 
 class Clock(NamedTuple):
@@ -93,6 +97,33 @@ def _rounded(time, valid, band, slope: float, worth: float, step: float | None) 
     return None if whole else _line(time, valid, band, step, 1)
 
 
+def with_gaps(
+    time: Float[np.ndarray, "N T"],
+    valid: Bool[np.ndarray, "N T"],
+    *,
+    digit: Float[np.ndarray, "#N #T"],
+    rounding: float,
+) -> Float[np.ndarray, "N T"] | None:
+    """Times on the equal steps that they were rounded from, of which some are not there; None if they are from none.
+
+    **Arguments:** as of `clock_of`.
+    """
+    worth = float(np.max(np.where(valid, digit, 0.0)))
+    steps = np.where(valid[:, 1:], np.diff(time, axis=1), np.nan)
+    shortest = float(np.nanmin(steps))
+    step = float(np.mean(steps[steps < 1.5 * shortest + worth]))
+    # Uneven times lie near multiples of a step by chance where the digit is not a small share of it.
+    if not worth < FINE * step:
+        return None
+    whole = np.where(valid[:, 1:], np.round(steps / step), 0)
+    if whole.max() > MOST_LOST or (np.abs(steps - whole * step) > worth + rounding + 0.01 * step)[valid[:, 1:]].any():
+        return None
+    index = np.concatenate([np.zeros((len(time), 1), int), np.cumsum(whole.astype(int), axis=1)], axis=1)
+    slope = _slope(time, valid, index)
+    line = _line(time, valid, np.broadcast_to(digit / 2 + rounding, time.shape), slope, ROUNDS, index)
+    return None if line is None else line.time
+
+
 def digit_of(time: Shaped[np.ndarray, "N T"], valid: Bool[np.ndarray, "N T"]) -> float:
     """What the last digit of numbers is worth (s), judged by the numbers: decimals, or the spacing of their floats.
 
@@ -154,9 +185,14 @@ def _binary_grid(values: Float[np.ndarray, " S"], least: float) -> float:
     return float(power)
 
 
-def _slope(time: Float[np.ndarray, "N T"], valid: Bool[np.ndarray, "N T"]) -> float:
-    """Slope of the straight lines with one slope that are nearest to the times of all trajectories (least squares)."""
-    index = np.where(valid, np.arange(time.shape[1]), 0)
+def _slope(
+    time: Float[np.ndarray, "N T"], valid: Bool[np.ndarray, "N T"], number: Int[np.ndarray, "N T"] | None = None
+) -> float:
+    """Slope of the straight lines with one slope that are nearest to the times of all trajectories (least squares).
+
+    `number`: which sample each is; by default none is missing.
+    """
+    index = np.where(valid, np.arange(time.shape[1]) if number is None else number, 0)
     count = valid.sum(axis=1, keepdims=True)
     index = np.where(valid, index - index.sum(axis=1, keepdims=True) / count, 0)
     from_first = np.where(valid, time - time[:, :1], 0)  # exact for neighbours, however large the times
@@ -172,17 +208,18 @@ def _line(
     tolerance: Float[np.ndarray, "#N #T"],
     slope: float,
     rounds: int,
+    number: Int[np.ndarray, "N T"] | None = None,
 ) -> Clock | None:
     """Lines of one slope within the tolerances of all times, with the slope `slope` if it can be; None if none are.
 
     A line of slope s exists where the excess `max_k (t_k - tol_k - s k) - min_k (t_k + tol_k - s k)` is not positive:
     convex in s, with the slope `argmin - argmax`, by which the interval that s is in is halved.
     """
-    index = np.arange(time.shape[1])
+    index = np.broadcast_to(np.arange(time.shape[1]) if number is None else number, time.shape)
     start = time[:, :1]
     low = np.where(valid, time - start - tolerance, -np.inf)
     high = np.where(valid, time - start + tolerance, np.inf)
-    steps = np.diff(time, axis=1)[valid[:, 1:]]
+    steps = (np.diff(time, axis=1) / np.maximum(np.diff(index, axis=1), 1))[valid[:, 1:]]
     wide = 2 * float(np.max(tolerance))
     below, above = float(steps.min()) - wide, float(steps.max()) + wide
     for _ in range(rounds):
@@ -192,7 +229,7 @@ def _line(
         if excess[worst] <= 0:
             begin = np.sum(np.where(valid, time - start - slope * index, 0), axis=1) / valid.sum(axis=1)
             return Clock(slope, start + begin[:, None] + slope * index)
-        rise = int(upper[worst].argmin()) - int(lower[worst].argmax())
+        rise = int(index[worst, upper[worst].argmin()]) - int(index[worst, lower[worst].argmax()])
         if rise == 0:
             return None
         below, above = (below, slope) if rise > 0 else (slope, above)
