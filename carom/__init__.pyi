@@ -57,6 +57,9 @@ from .simulation.files import save_recording as save_recording
 from .simulation.integrators import RK4 as RK4
 from .simulation.mujoco_files import MujocoModel as MujocoModel
 from .simulation.mujoco_files import load_mujoco as load_mujoco
+from .simulation.observations import Observations as Observations
+from .simulation.observations import load_observations as load_observations
+from .simulation.observations import save_observations as save_observations
 from .simulation.poses import PoseRecording as PoseRecording
 from .simulation.poses import load_poses as load_poses
 from .simulation.recording import Recording as Recording

@@ -16,7 +16,7 @@ import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,8 +28,27 @@ COORDINATE = re.compile(r"(v?)([xyz])(\d+)")
 WITH_UNIT = re.compile(r"(?P<name>t|time|v?[xyz]\d+)\s*([\[({].*|[/_,]\s*\S.*|in\s.*)")
 SHORTEST_DIGIT = 1e-9
 """Times with more decimals (s) are floats as they are."""
+MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
+"""What stands in a cell whose number is not there."""
 DIFFERENCES = "velocities by differences of positions"
 """What `source` says where they are."""
+
+
+class Table(NamedTuple):
+    """What a CSV holds, padded by each trajectory's last sample.
+
+    `parts`: `x` and, if they are there, `v` and `contact`, as `Recording.of` takes them; `time` (s) and what its last
+    digits are worth; `length` of each trajectory; its rows in `groups`, and their `lines`; `clock`, the name of the
+    column of times.
+    """
+
+    parts: dict[str, Any]
+    time: Float[np.ndarray, "N T"]
+    digit: Float[np.ndarray, "N T"]
+    length: Int[np.ndarray, " N"]
+    groups: list[list[int]]
+    lines: list[int]
+    clock: str
 
 
 def read_csv(path: Path) -> dict[str, Any]:
@@ -37,6 +56,46 @@ def read_csv(path: Path) -> dict[str, Any]:
 
     **Raises:** `CaromError` naming line and column, what was there, and what to do; `OSError` if it cannot be read.
     """
+    table = _table(path, missing=False)
+    length, x = table.length, table.parts["x"]
+    found = _equal_steps(table.time, table.digit, length)
+    if isinstance(found, Irregular):
+        k, s = found.trajectory, found.sample
+        first = table.groups[k][s]
+        raise CaromError(_unequal(found, table.clock, table.lines[first : first + 2], table.time[k, s : s + 2]))
+    out: dict[str, Any] = {**table.parts, "time": found.time, "dt": found.step, "length": length}
+    if "v" not in out:
+        if length.min() < 3:
+            raise CaromError("trajectories without velocities must have at least 3 samples; one had fewer.")
+        out["v"] = np.zeros_like(x)
+        for k, n in enumerate(length):
+            out["v"][k, :n] = np.gradient(x[k, :n], found.step, axis=0, edge_order=2)
+        out["source"] = DIFFERENCES
+    return out
+
+
+def read_samples(path: Path) -> dict[str, Any]:
+    """What `Observations.checked` takes: nothing is made, times are any, and cells may be empty where nothing was seen.
+
+    **Raises:** as `read_csv`.
+    """
+    table = _table(path, missing=True)
+    digit = table.digit
+    if digit.min() < SHORTEST_DIGIT:  # all that a float had was printed, which may be less
+        digit = np.maximum(digit, digit_of(table.time, np.arange(digit.shape[1]) < table.length[:, None]))
+    with np.errstate(invalid="ignore"):
+        back = np.argwhere((np.diff(table.time, axis=1) <= 0) & (np.arange(1, digit.shape[1]) < table.length[:, None]))
+    if len(back):
+        k, s = back[0]
+        row, times = table.groups[k][s], table.time[k, s : s + 2]
+        found = Irregular(int(k), int(s), float(times[1] - times[0]), 0.0, True, float(digit[k, s]), False)
+        where = _unequal(found, table.clock, table.lines[row : row + 2], times)
+        raise CaromError(f"{where} (trajectory {k}, sample {s + 1})")
+    return {**table.parts, "time": table.time, "digit": digit, "length": table.length}
+
+
+def _table(path: Path, *, missing: bool) -> Table:
+    """What is in the file; cells of positions and velocities may be empty if they may be `missing`."""
     rows, names = _rows(path)
     _check_names(names)
     columns = {name: k for k, name in enumerate(names)}
@@ -53,7 +112,13 @@ def read_csv(path: Path) -> dict[str, Any]:
         wanted += [f"v{axis}{p}" for p in range(points) for axis in "xyz"[:dim]]
     wanted += ["contact"] if "contact" in columns else []
     _check_first(rows[0], [columns[name] for name in wanted])
-    table = np.array([[_number(row[columns[name]], name, line) for name in wanted] for line, row in rows])
+    gaps = [missing and name != clock for name in wanted]
+    table = np.array(
+        [
+            [_number(row[columns[name]], name, line, gap) for name, gap in zip(wanted, gaps, strict=True)]
+            for line, row in rows
+        ]
+    )
     lines = [line for line, _ in rows]
     groups = _trajectories(labels, lines)
     most = max(len(group) for group in groups)
@@ -63,27 +128,16 @@ def read_csv(path: Path) -> dict[str, Any]:
         return np.stack([part[[*group, *([group[-1]] * (most - len(group)))]] for group in groups])
 
     count = points * dim
-    x = padded(table[:, 1 : 1 + count]).reshape(len(groups), most, points, dim)
-    length = np.array([len(group) for group in groups])
+    shape = (len(groups), most, points, dim)
     digits = digits_of([row[columns[clock]] for _, row in rows])
     time = padded(np.stack([table[:, 0], digits], axis=1))
-    found = _equal_steps(time[..., 0], time[..., 1], length)
-    if isinstance(found, Irregular):
-        first = groups[found.trajectory][found.sample]
-        raise CaromError(_unequal(found, clock, lines[first : first + 2], table[first : first + 2, 0]))
-    out: dict[str, Any] = {"x": x, "time": found.time, "dt": found.step, "length": length}
+    parts: dict[str, Any] = {"x": padded(table[:, 1 : 1 + count]).reshape(shape)}
     if has_velocity:
-        out["v"] = padded(table[:, 1 + count : 1 + 2 * count]).reshape(x.shape)
-    else:
-        if length.min() < 3:
-            raise CaromError("trajectories without velocities must have at least 3 samples; one had fewer.")
-        out["v"] = np.zeros_like(x)
-        for k, n in enumerate(length):
-            out["v"][k, :n] = np.gradient(x[k, :n], found.step, axis=0, edge_order=2)
-        out["source"] = DIFFERENCES
+        parts["v"] = padded(table[:, 1 + count : 1 + 2 * count]).reshape(shape)
     if "contact" in columns:
-        out["contact"] = _flags(padded(table[:, -1:])[..., 0])
-    return out
+        flags = padded(table[:, -1:])[..., 0]
+        parts["contact"] = _flags(np.where(np.isnan(flags), 0, flags))
+    return Table(parts, time[..., 0], time[..., 1], np.array([len(g) for g in groups]), groups, lines, clock)
 
 
 def _rows(path: Path) -> tuple[list[tuple[int, list[str]]], list[str]]:
@@ -168,8 +222,10 @@ def _check_first(row: tuple[int, list[str]], wanted: list[int]) -> None:
         raise CaromError(f"line {line} holds no numbers ({shown}): leave it out; units are s, m and m/s.")
 
 
-def _number(text: str, name: str, line: int) -> float:
+def _number(text: str, name: str, line: int, may_be_missing: bool) -> float:
     text = text.strip()
+    if may_be_missing and text.lower() in MISSING:
+        return np.nan
     try:
         value = float(text)
     except ValueError:
@@ -186,7 +242,7 @@ def _number(text: str, name: str, line: int) -> float:
         raise CaromError(
             f"{where} must be a number with a decimal point; it was {text[:40]!r}: replace decimal commas by points."
         )
-    advice = f": {gap}" if text.lower() in ("nan", "na", "n/a", "null", "none", "-") else ""
+    advice = f": {gap}" if text.lower() in MISSING else ""
     raise CaromError(f"{where} must be a number; it was {text[:40]!r}{advice}.")
 
 

@@ -20,6 +20,7 @@ import io
 import os
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,10 +29,12 @@ import numpy as np
 
 from carom.atomic import write_whole
 from carom.errors import CaromError
-from carom.simulation.csv_files import encode_csv, read_csv
+from carom.simulation.csv_files import encode_csv, read_csv, read_samples
 from carom.simulation.recording import STATE_AXES, Recording, brief, plain_text, require_part, time_step
 
 ARRAYS = ("x", "v", "time", "contact", "length", "group")
+MASKS = ("seen", "mask")
+"""What files of positions may have besides: which samples there are."""
 TEXTS = ("units", "task", "source", "carom_version")
 ATTRIBUTES = ("checksum", "dt", *TEXTS)
 
@@ -46,16 +49,7 @@ def load_recording(path: str | os.PathLike[str], *, task: str | None = None) -> 
     """
     path = Path(path)
     try:
-        content = _read(path)
-        checksum = content.pop("checksum", None)
-        require_part(
-            checksum is None or checksum == _checksum(content),
-            "checksum",
-            "match the data",
-            "another: the file was damaged or changed after it was written",
-            "copy or make the file again",
-        )
-        recording = Recording.of(**content)
+        recording = Recording.of(**_verified(_read(path)))
         wanted = f"be {task!r}"
         advice = "this is a file of another task: choose another file, name its own task, or take task out of it"
         require_part(task is None or recording.task in ("", task), "task", wanted, recording.task, advice)
@@ -90,7 +84,50 @@ def save_recording(path: str | os.PathLike[str], recording: Recording) -> None:
         raise CaromError(f"{path}: {error}") from error.__cause__
 
 
+def read_positions(path: Path) -> dict[str, Any]:
+    """What a file holds of which positions are enough: no velocities need be there, and samples may be missing.
+
+    **Raises:** `CaromError` naming the part that is wrong, what it was, and what to do.
+    """
+    return _verified(_read(path, positions=True))
+
+
+def write_content(path: Path, content: Mapping[str, Any]) -> None:
+    """Write arrays and attributes of a trajectory file, which are taken as right, with a checksum."""
+    whole = {**content, "carom_version": _version()}
+    write_whole(path, _format(path).encode({"checksum": _checksum(whole), **whole}).getbuffer())
+
+
+def names_in(path: Path) -> set[str]:
+    """The names of the arrays in a file, of NPZ or HDF5; none of others, or of what cannot be read."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                return {name.removesuffix(".npy") for name in archive.namelist()}
+        if suffix in (".h5", ".hdf5"):
+            _check_heaps(path.read_bytes())
+            with h5py.File(path, "r") as file:
+                return set(file)
+    except Exception:  # whoever reads the file says what is wrong with it
+        return set()
+    return set()
+
+
 # ----------------------------------------------------------------------------------------- content
+
+
+def _verified(content: dict[str, Any]) -> dict[str, Any]:
+    """Without its checksum, which must be that of the rest."""
+    checksum = content.pop("checksum", None)
+    require_part(
+        checksum is None or checksum == _checksum(content),
+        "checksum",
+        "match the data",
+        "another: the file was damaged or changed after it was written",
+        "copy or make the file again",
+    )
+    return content
 
 
 def _checksum(content: Mapping[str, Any]) -> str:
@@ -112,13 +149,13 @@ def _version() -> str:
         return "unknown"
 
 
-def _arrays_in(names: Iterable[str]) -> list[str]:
-    """Which of these are arrays of a trajectory file; x and v must be."""
+def _arrays_in(names: Iterable[str], positions: bool) -> list[str]:
+    """Which of these are arrays of a trajectory file; x and, if not `positions` are enough, v must be."""
     names = list(names)
-    for name in ("x", "v"):
+    for name in ("x",) if positions else ("x", "v"):
         was = f"missing, the file holds {', '.join(names) or 'nothing'}"
         require_part(name in names, name, f"be there, with the axes ({', '.join(STATE_AXES)})", was)
-    return [name for name in ARRAYS if name in names]
+    return [name for name in (*ARRAYS, *(MASKS if positions else ())) if name in names]
 
 
 def _attribute(name: str, value: Any) -> float | str:
@@ -128,11 +165,11 @@ def _attribute(name: str, value: Any) -> float | str:
 # ----------------------------------------------------------------------------------------- formats
 
 
-def _decode_hdf5(path: Path) -> dict[str, Any]:
+def _decode_hdf5(path: Path, positions: bool) -> dict[str, Any]:
     require_part(h5py.is_hdf5(path), "the file", "be HDF5", "something else", "name it by its format")
     _check_heaps(path.read_bytes())
     with h5py.File(path, "r") as file:
-        arrays = {name: _hdf5_array(file, name) for name in _arrays_in(file)}
+        arrays = {name: _hdf5_array(file, name) for name in _arrays_in(file, positions)}
         names = [name for name in ATTRIBUTES if name in file.attrs]
         return {**arrays, **{name: _attribute(name, file.attrs[name]) for name in names}}
 
@@ -180,14 +217,14 @@ def _encode_hdf5(content: Mapping[str, Any]) -> io.BytesIO:
     return buffer
 
 
-def _decode_npz(path: Path) -> dict[str, Any]:
+def _decode_npz(path: Path, positions: bool) -> dict[str, Any]:
     advice = "name it by its format, or copy or make it again"
     with path.open("rb") as file:
         good = zipfile.is_zipfile(file)
         require_part(good, "the file", "be NPZ", "something else or truncated", advice)
         file.seek(0)
         archive = np.load(file, allow_pickle=False)
-        arrays = {name: _npz_array(archive, name) for name in _arrays_in(archive)}
+        arrays = {name: _npz_array(archive, name) for name in _arrays_in(archive, positions)}
         names = [name for name in ATTRIBUTES if name in archive]
         return {**arrays, **{name: _attribute(name, _npz_array(archive, name)) for name in names}}
 
@@ -213,15 +250,17 @@ def _encode_npz(content: Mapping[str, Any]) -> io.BytesIO:
 
 class _Format(NamedTuple):
     decode: Callable[[Path], dict[str, Any]]
+    decode_positions: Callable[[Path], dict[str, Any]]
     encode: Callable[[Mapping[str, Any]], io.BytesIO]
 
 
-_HDF5 = _Format(_decode_hdf5, _encode_hdf5)
+_HDF5 = _Format(partial(_decode_hdf5, positions=False), partial(_decode_hdf5, positions=True), _encode_hdf5)
+_NPZ = _Format(partial(_decode_npz, positions=False), partial(_decode_npz, positions=True), _encode_npz)
 _FORMATS = {
     ".h5": _HDF5,
     ".hdf5": _HDF5,
-    ".npz": _Format(_decode_npz, _encode_npz),
-    ".csv": _Format(read_csv, encode_csv),
+    ".npz": _NPZ,
+    ".csv": _Format(read_csv, read_samples, encode_csv),
 }
 
 
@@ -232,10 +271,11 @@ def _format(path: Path) -> _Format:
     return _FORMATS[suffix]
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, *, positions: bool = False) -> dict[str, Any]:
     require_part(os.path.exists(path), "the file", "exist", "not there", "check its name")
     require_part(os.path.isfile(path), "this", "be a file", "a folder or device", "name a file")
-    decode = _format(path).decode
+    found = _format(path)
+    decode = found.decode_positions if positions else found.decode
     try:
         path.open("rb").close()
     except OSError as error:

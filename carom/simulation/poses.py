@@ -14,6 +14,7 @@ A pose file (NPZ or HDF5) holds, under the first or the second name,
 """
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ NAMES = {
 }
 POSE_STEP_TOLERANCE = 1e-3
 """Largest difference of two time steps that count as equal, relative to the step: the clocks of cameras jitter."""
+UNIT = 0.01
+"""Largest difference of a quaternion's length from 1."""
 WINDOW = 3
 """Samples on each side that a velocity is estimated from, as far as no impact lies between."""
 
@@ -101,7 +104,7 @@ class PoseRecording(eqx.Module):
             require(not bad.any(), f"{name} must be finite; trajectory {_first(bad)} was not.")
             parts[name] = _hold_last(part, length)
         size = np.linalg.norm(parts["quaternion"], axis=2)
-        bad = (np.abs(size - 1) > 0.01) & valid
+        bad = (np.abs(size - 1) > UNIT) & valid
         require(
             not bad.any(),
             f"quaternion must have length 1; in trajectory {_first(bad)} it was {size[bad][:1]}.",
@@ -175,6 +178,54 @@ def load_poses(path: str | os.PathLike[str], *, keep_copies: bool = False) -> tu
     return poses.select(copies < 0), int((copies >= 0).sum())
 
 
+def is_pose_file(names: Collection[str]) -> bool:
+    """Whether arrays of these names are poses, and not points."""
+    return "x" not in names and all(any(name in names for name in NAMES[part]) for part in ("position", "quaternion"))
+
+
+def pose_points(path: Path) -> dict[str, Any]:
+    """The points of a pose file's body and their times, as `Observations.checked` takes them.
+
+    Nothing is estimated: points have velocities where the file has both `velocity` and `omega`; times are as recorded,
+    and samples may be missing (NaN). Copies (`dup_of`) are left out.
+
+    **Raises:** `CaromError` naming what does not fit.
+    """
+    arrays = _read(path)
+    copies, dt = arrays.pop("dup_of", None), arrays.pop("dt", None)
+    if "offsets" in arrays:
+        arrays |= _padded(arrays)
+    position, quaternion = np.asarray(arrays["position"], float), np.asarray(arrays["quaternion"], float)
+    require(
+        position.ndim == 3 and position.shape[2] == 3 and quaternion.shape == (*position.shape[:2], 4),
+        "position and quaternion must have the shapes (trajectory, time, 3) and (trajectory, time, 4), w first; they "
+        f"were {position.shape} and {quaternion.shape}.",
+    )
+    size = np.linalg.norm(quaternion, axis=2)
+    valid = np.arange(position.shape[1]) < arrays.get("length", np.full(len(position), position.shape[1]))[:, None]
+    bad = (np.abs(size - 1) > UNIT) & valid  # NaN is no number that is wrong
+    require(
+        not bad.any(),
+        f"quaternion must have length 1, or be NaN where it was not seen; in trajectory {_first(bad)} it was "
+        f"{size[bad][:1]}.",
+    )
+    whole = np.isfinite(size) & (size > 0)
+    flat = np.where(whole[..., None], quaternion, [1.0, 0, 0, 0]).reshape(-1, 4)
+    rotation = Rotation.from_quat(flat, scalar_first=True).as_matrix().reshape(*size.shape, 3, 3)
+    axes = np.where(whole[..., None, None], np.swapaxes(rotation, 2, 3), np.nan)
+    out: dict[str, Any] = {"x": np.concatenate([position[:, :, None], position[:, :, None] + axes], axis=2)}
+    if "velocity" in arrays and "omega" in arrays:
+        velocity = np.asarray(arrays["velocity"], float)[:, :, None]
+        spin = np.cross(np.einsum("ntij,ntj->nti", rotation, np.asarray(arrays["omega"], float))[:, :, None], axes)
+        out["v"] = np.concatenate([velocity, velocity + spin], axis=2)
+    require("time" in arrays or dt is not None, "dt (s) is missing, and there is no time.")
+    out["time"] = arrays["time"] if "time" in arrays else float(np.asarray(dt)) * np.arange(position.shape[1])
+    out |= {name: arrays[name] for name in ("length", "group") if name in arrays}
+    if copies is not None:
+        out = {n: part[copies < 0] if n != "time" or np.ndim(part) == 2 else part for n, part in out.items()}
+    return out
+
+
 def _read(path: Path) -> dict[str, np.ndarray]:
     require(path.suffix.lower() in (".npz", ".h5", ".hdf5"), "a pose file must end in .npz, .h5 or .hdf5.")
     require(path.is_file(), "there is no such file.")
@@ -225,6 +276,8 @@ def _padded(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     length = np.diff(offsets)
     rows = (offsets[:-1, None] + np.arange(length.max())).clip(max=total - 1)
     names = [name for name in ("position", "quaternion", "velocity", "omega") if name in arrays]
+    if np.shape(arrays.get("time")) == (total,):
+        names.append("time")
     for name in names:
         require(
             len(arrays[name]) == total, f"{name} must have {total} samples, as position; it had {len(arrays[name])}."

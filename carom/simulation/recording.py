@@ -70,15 +70,15 @@ class Recording(eqx.Module):
         Raises:
             CaromError: naming the argument, what it was, and what to do.
         """
-        x, v = _states("x", x), _states("v", v)
+        x, v = as_states("x", x), as_states("v", v)
         require_part(v.shape == x.shape, "v", f"have the shape of x, {x.shape}", v.shape)
-        length = _lengths(length, x.shape)
+        length = as_lengths(length, x.shape)
         valid = np.arange(x.shape[1]) < length[:, None]
         _check_finite("x", x, valid, STATE_AXES)
         _check_finite("v", v, valid, STATE_AXES)
         time, dt = _clock(time, dt, valid)
-        contact = None if contact is None else _flags(contact, x.shape)
-        group = None if group is None else _groups(group, x.shape[0])
+        contact = None if contact is None else as_flags(contact, x.shape)
+        group = None if group is None else as_groups(group, x.shape[0])
         texts = {"units": units, "task": task, "source": source, "carom_version": carom_version}
         texts = {name: plain_text(name, text) for name, text in texts.items()}
         return cls(x=x, v=v, contact=contact, time=time, length=length, group=group, dt=dt, **texts)
@@ -161,7 +161,8 @@ def _doubles(array: np.ndarray) -> Float64[np.ndarray, "..."]:
         return np.asarray(array, dtype=np.float64, order="C")
 
 
-def _states(name: str, value: Any) -> Float64[np.ndarray, "N T n d"]:
+def as_states(name: str, value: Any) -> Float64[np.ndarray, "N T n d"]:
+    """Positions or velocities in double precision; `CaromError` if the axes are wrong."""
     array = _numbers(name, value, STATE_AXES)
     n, samples, points, dim = array.shape
     was = f"of shape {array.shape}"
@@ -171,7 +172,8 @@ def _states(name: str, value: Any) -> Float64[np.ndarray, "N T n d"]:
     return _doubles(array)
 
 
-def _lengths(value: Any, shape: tuple[int, ...]) -> Int64[np.ndarray, " N"]:
+def as_lengths(value: Any, shape: tuple[int, ...]) -> Int64[np.ndarray, " N"]:
+    """Valid samples of the trajectories of states of this shape, all by default; `CaromError` if they cannot be."""
     n, samples = shape[:2]
     array = np.full(n, samples) if value is None else np.asarray(value)
     was = f"{array.dtype} of shape {array.shape}"
@@ -183,7 +185,8 @@ def _lengths(value: Any, shape: tuple[int, ...]) -> Int64[np.ndarray, " N"]:
     return array.astype(np.int64)
 
 
-def _flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
+def as_flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
+    """Flags of the samples of states of this shape; `CaromError` if they are not."""
     array = np.asarray(value)
     wanted = f"have the shape {shape[:2]}, a flag for each sample of x"
     require_part(array.shape == shape[:2], "contact", wanted, array.shape, "correct or remove it")
@@ -194,7 +197,8 @@ def _flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
     return array.astype(bool)
 
 
-def _groups(value: Any, count: int) -> Int64[np.ndarray, " N"]:
+def as_groups(value: Any, count: int) -> Int64[np.ndarray, " N"]:
+    """The sessions of so many trajectories; `CaromError` if they are not integers."""
     array = np.asarray(value)
     good = array.dtype.kind in "iu" and array.shape == (count,)
     was = f"{array.dtype} of shape {array.shape}"
@@ -238,6 +242,19 @@ def time_step(value: Any) -> float:
     return number
 
 
+def as_times(value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "N T"]:
+    """Times in double precision, a row for each trajectory; `CaromError` if they are not as many as the samples."""
+    raw = _times(value, shape)
+    return np.broadcast_to(_doubles(raw), shape).copy()
+
+
+def _times(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    raw = _numbers("time", value, STATE_AXES[:2] if np.ndim(value) == 2 else STATE_AXES[1:2])
+    wanted = shape[-raw.ndim :]
+    require_part(raw.shape == wanted, "time", f"have the shape {wanted}, as x", raw.shape)
+    return raw
+
+
 def _clock(time: Any, dt: Any, valid: np.ndarray) -> tuple[Float64[np.ndarray, " T"], float]:
     """The times of the samples and the step between them, from either or both."""
     n, samples = valid.shape
@@ -247,10 +264,8 @@ def _clock(time: Any, dt: Any, valid: np.ndarray) -> tuple[Float64[np.ndarray, "
             raise CaromError("dt and time are both missing; give dt, the time step in seconds.")
         return dt * np.arange(samples), dt
 
-    axes = STATE_AXES[:2] if np.ndim(time) == 2 else STATE_AXES[1:2]
-    raw = _numbers("time", time, axes)
-    shape = (n, samples)[-raw.ndim :]
-    require_part(raw.shape == shape, "time", f"have the shape {shape}, as x", raw.shape)
+    raw = _times(time, (n, samples))
+    axes = STATE_AXES[:2] if raw.ndim == 2 else STATE_AXES[1:2]
     longest = int(np.argmax(valid.sum(axis=1)))
     inside = valid[longest]
     valid = valid if raw.ndim == 2 else inside
