@@ -83,8 +83,8 @@ class Observations(NamedTuple):
 
         **Raises:** `CaromError` naming the argument, the trajectory and sample, and what to do.
         """
-        x, times = as_states("x", x), as_times(time, np.shape(x)[:2])
-        x = _left_out(x, seen)
+        x = _left_out(as_states("x", x), seen)
+        times = as_times(time, x.shape[:2])
         v = None if v is None else _left_out(as_states("v", v), seen)
         require(v is None or v.shape == x.shape, f"v must have the shape of x, {x.shape}; it was {np.shape(v)}.")
         for name, part in (("x", x), ("v", v)):
@@ -143,8 +143,13 @@ class Observations(NamedTuple):
         rows = np.arange(self.n_trajectories)[indices].reshape(-1)
         require(len(rows) > 0, "indices must name at least one trajectory; there was none.")
         most = int(self.length[rows].max())
-        parts = [None if part is None else part[rows, :most] for part in (self.time, self.x, self.v, self.contact)]
-        return Observations(*parts, None if self.group is None else tuple(self.group[k] for k in rows))
+        return Observations(
+            time=self.time[rows, :most],
+            x=self.x[rows, :most],
+            v=None if self.v is None else self.v[rows, :most],
+            contact=None if self.contact is None else self.contact[rows, :most],
+            group=None if self.group is None else tuple(self.group[k] for k in rows),
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence["Observations"]) -> "Observations":
@@ -318,9 +323,9 @@ def _grown(
     """Times, which must be there and grow; put on equal steps where they were rounded from some."""
     bad = ~np.isfinite(times) & valid
     require(not bad.any(), f"time must be finite in each trajectory up to its end; {_at(bad)} was not: leave it out.")
+    back = np.zeros(valid.shape, bool)
     with np.errstate(invalid="ignore", over="ignore"):
-        back = np.pad(~(np.diff(times, axis=1) > 0), ((0, 0), (1, 0))) & valid
-    back[:, 0] = False
+        back[:, 1:] = (np.diff(times, axis=1) <= 0) & valid[:, 1:]
     if back.any():
         k, s = np.argwhere(back)[0]
         now, before = times[k, s], times[k, s - 1]

@@ -276,7 +276,7 @@ def _padded(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     length = np.diff(offsets)
     rows = (offsets[:-1, None] + np.arange(length.max())).clip(max=total - 1)
     names = [name for name in ("position", "quaternion", "velocity", "omega") if name in arrays]
-    if np.shape(arrays.get("time")) == (total,):
+    if "time" in arrays and arrays["time"].shape == (total,):
         names.append("time")
     for name in names:
         require(
