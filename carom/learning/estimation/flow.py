@@ -37,7 +37,9 @@ class Hits(NamedTuple):
     window: Int[np.ndarray, " H"]
     step: Int[np.ndarray, " H"]
     jump: Float[np.ndarray, " H"]  # m/s
-    by_theta: Float[np.ndarray, "H P"]  # m/s, of velocities after it, by each free number
+    by_theta: Float[
+        np.ndarray, "H P"
+    ]  # m/s, of velocities after it, by each free number, or of positions over the step
     closed: Bool[np.ndarray, "H C"]  # whose gaps can have closed
 
 
@@ -179,7 +181,7 @@ class Flow:
                 jump = np.linalg.norm(new[:, 1].reshape(-1, half) - alone[rows], axis=1)
                 hit = jump > 1e-9 * np.linalg.norm(alone[rows], axis=1)
                 if hit.any():
-                    strength = np.linalg.norm(own[hit][:, half:, size:], axis=1)
+                    strength = _strength(own[hit][:, :, size:], steps[rows, at[rows]][hit])
                     hits.append((rows[hit], at[rows][hit], jump[hit], strength, closed[rows][hit]))
                 commit(rows, new, own)
                 waiting[rows] = False
@@ -196,3 +198,9 @@ def _none(P: int, C: int) -> Hits:
 def _batches(rows: np.ndarray, size: int):
     for first in range(0, len(rows), size):
         yield rows[first : first + size]
+
+
+def _strength(by_theta: Float[np.ndarray, "H S P"], dt: Float[np.ndarray, " H"]) -> Float[np.ndarray, "H P"]:
+    half = by_theta.shape[1] // 2
+    places, speeds = (np.linalg.norm(part, axis=1) for part in (by_theta[:, :half], by_theta[:, half:]))
+    return np.maximum(places / dt[:, None], speeds)

@@ -6,6 +6,7 @@ impacts each and are cut in the middle of free motion, so that each sample is in
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -59,8 +60,9 @@ class Windows(NamedTuple):
         wide = {"steps": (most, np.nan), "x": (most + 1, np.nan), "before": (most + 1, False), "kink": (most, False)}
         return cls(
             **{
-                name: np.concatenate([padded(getattr(p, name), *wide[name]) if name in wide else getattr(p, name)
-                                      for p in parts])
+                name: np.concatenate(
+                    [padded(getattr(p, name), *wide[name]) if name in wide else getattr(p, name) for p in parts]
+                )
                 for name in cls._fields
             }
         )
@@ -118,7 +120,7 @@ def _noise(tracks, *, robust: bool) -> Float[np.ndarray, " n"]:
         ends = [-1, *kinks, len(time) - 1]
         for p in range(n):
             runs = []
-            for a, b in zip(ends, ends[1:], strict=False):
+            for a, b in pairwise(ends):
                 rows = np.arange(a + 1, b + 1)
                 rows = rows[np.isfinite(x[rows, p, 0])]
                 runs += [rows[k : k + REACH] for k in range(0, len(rows) - REACH + 1, 3 if robust else REACH)]
@@ -242,7 +244,7 @@ def _cuts(track: Track, impacts: int | None) -> list[tuple[int, int]]:
         else:
             groups.append([k])
     cuts, since = [], 0
-    for here, there in zip(groups, groups[1:], strict=False):
+    for here, there in pairwise(groups):
         since += len(here)
         if impacts is not None and since >= impacts:
             middle = (here[-1] + 1 + there[0]) // 2
