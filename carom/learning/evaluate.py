@@ -116,8 +116,8 @@ def evaluate(
     """Measures of `system` on test recordings, and its predictions.
 
     **Arguments:** `system`, learned; `recording`, test data; `truth`, the true system where it is known, for the errors
-    of properties and the drift of the true energy; `formulation`, `compensation_steps` and `impact` of the predictions, as
-    those of `simulate`.
+    of properties and the drift of the true energy; `formulation`, `compensation_steps` and `impact` of the predictions,
+    as those of `simulate`.
 
     **Returns:** a dictionary of numbers (definitions: the paper, section 5 and appendix L; the first of each pair below
     is the paper's) with

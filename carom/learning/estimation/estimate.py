@@ -41,9 +41,9 @@ SLIDING = 0.1
 """Frictions begin at this value at most: what sticks does not tell how rough it is."""
 INSIDE = (0.2, 0.9)
 """Restitutions begin between these."""
-SHORT: tuple[Loss, ...] = ("convex",) * 3 + ("redescending",) * 5
-LONG: tuple[Loss, ...] = ("convex",) * 2 + ("redescending",) * 3
-LAST: tuple[Loss, ...] = ("squares",) * 4
+SHORT: tuple[Loss, ...] = ("convex",) * 3 + ("redescending",) * 3
+LONG: tuple[Loss, ...] = ("convex", *("redescending",) * 3)
+LAST: tuple[Loss, ...] = ("squares",) * 3
 AT_SAMPLES = 0.05
 """Kinks that are within so much of a step of a sample are at it."""
 
@@ -66,7 +66,7 @@ class Told(NamedTuple):
     theta: Float[np.ndarray, " P"]
     covariance: Float[np.ndarray, "P P"]
     held: list[Held]
-    evaluation: dict[str, float]
+    evaluation: dict[str, float | int]
     step: float
     seconds: float
 
@@ -187,16 +187,36 @@ def _by_rule(
 
     shooting = shooting_of(short)
     require(bool(shooting.used.any()), "the observations have no window with free motion to learn from.")
-    state = shoot(shooting, theta, short.start, SHORT, each=part(0.0, 0.6, "windows of an impact each", 8))
+    state = shoot(shooting, theta, short.start, SHORT, each=part(0.0, 0.6, "windows of an impact each", len(SHORT)))
+    state = _begun_again(shooting, state, shooting_of)
     longer = windows_of(found, None)
     wide = shooting_of(longer)
-    there = shoot(wide, state.theta, _starts(short, state, longer), LONG, each=part(0.6, 0.8, "longer windows", 5))
+    each = part(0.6, 0.8, "longer windows", len(LONG))
+    there = shoot(wide, state.theta, _starts(short, state, longer), LONG, each=each)
+    there = _begun_again(wide, there, shooting_of)
     windows, z = _those_that_fit(wide, there, short, state)
     shooting = shooting_of(windows)
     state = shooting.at(there.theta, z)
     shooting.keep_what_fits(state)
     state = shoot(shooting, state.theta, state.z, LAST, each=part(0.8, 1.0, "standard errors", len(LAST)))
     return _told(shooting, state, found, held, rule)
+
+
+def _begun_again(shooting: Shooting, state: State, shooting_of: Callable[[Windows], Shooting]) -> State:
+    """With starts of windows that do not fit found anew, from the samples before their first impacts.
+
+    They may have been led astray while the quantities were not known yet.
+    """
+    shooting.keep_what_fits(state)
+    lost = np.flatnonzero(~shooting.fits)
+    if not len(lost):
+        return state
+    part = shooting_of(shooting.windows.take(lost))
+    there = shoot(part, state.theta, part.windows.start, ("redescending",) * 4, held=True)
+    better = part.of_windows(there) < shooting.of_windows(state)[lost]
+    z = state.z.copy()
+    z[lost[better]] = there.z[better]
+    return shooting.at(state.theta, z)
 
 
 def _starts(short: Windows, state: State, longer: Windows) -> Float[np.ndarray, "W 2 n d"]:
@@ -238,7 +258,7 @@ def _told(shooting: Shooting, state: State, found: Survey, held: Bool[np.ndarray
     )
     estimates = estimates_of(shooting, state, of, explained=explained)
     system = learned.assemble(jnp.asarray(state.theta))
-    shown = [_shown(shooting, state, row) for row in np.flatnonzero(rows)]
+    shown = [_shown(shooting, state, row) for row in np.flatnonzero(rows).tolist()]
     return Told(system, estimates, fit, state.theta, of.covariance, shown, _evaluation(shown), found.step, 0.0)
 
 
@@ -251,7 +271,7 @@ def _shown(shooting: Shooting, state: State, row: int) -> Held:
     return Held(time[there], x, explained, state.z[row])
 
 
-def _evaluation(held: list[Held]) -> dict[str, float]:
+def _evaluation(held: list[Held]) -> dict[str, float | int]:
     """Errors of positions over their sizes, by the mean over time, then over windows."""
     errors = []
     for window in held:

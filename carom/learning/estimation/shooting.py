@@ -180,12 +180,15 @@ def shoot(
         if not held and len(g):
             ends = np.maximum(lower - state.theta, -MOST * scale), np.minimum(upper - state.theta, MOST * scale)
             change = newton_step(H, g, prior, change, change, *ends)
+        error = np.sqrt(np.diag(np.linalg.pinv(H + prior)) * size)
+        still = bool(np.all(np.abs(change) < SETTLED * error))
         for share in 0.25 ** np.arange(4):
             move = -(share * reduced.own + reduced.follow @ (share * change))
             there = shooting.at(state.theta + share * change, state.z + move.reshape(state.z.shape))
             now = shooting.costs(there, size, loss)
-            # At first starts have not been fitted to what comes after impacts.
-            if now[used].sum() < cost[used].sum() or k == 0:
+            # At first starts have not been fitted to what comes after impacts. At last a window that no longer fits
+            # counts for more than what a step wins.
+            if now[used].sum() < cost[used].sum() or k == 0 or (still and not held):
                 break
         else:
             settled = loss
@@ -196,8 +199,6 @@ def shoot(
         state = there
         if each is not None:
             each(float(np.sqrt(shooting.size(state))))
-        error = np.sqrt(np.diag(np.linalg.pinv(H + prior)) * size)
-        still = bool(np.all(np.abs(change) < SETTLED * error))
-        if share == 1 and still and (not held or fallen < SETTLED):
+        if still and (not held or fallen < SETTLED):
             settled = loss
     return state

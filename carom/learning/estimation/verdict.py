@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
@@ -165,8 +166,8 @@ def telling(shooting: Shooting, state: State) -> tuple[Int[np.ndarray, " P"], In
     return tells.sum(axis=0), without, int(shown.sum())
 
 
-NEEDS_NO_IMPACT = ("gravity", "stiffness", "rod", "anchor", "rest")
-"""Kinds of quantities of which free motion tells."""
+CONTACTS = ("mass", "friction", "restitution", "radius", "plane", "tilt", "inertia", "moments", "epsilon")
+"""Kinds of quantities of which impacts tell. (Of others free motion does.)"""
 
 
 def estimates_of(shooting: Shooting, state: State, found: Spread, *, explained: bool) -> list[Estimate]:
@@ -177,11 +178,12 @@ def estimates_of(shooting: Shooting, state: State, found: Spread, *, explained: 
     error = np.sqrt(np.diag(found.covariance))
     scale = np.asarray(learned.scale)
     values, lower, upper, beyond = (
-        np.asarray(learned.physical(state.theta + share * error), float) for share in (0.0, -width, width, 1e-3)
+        np.asarray(learned.physical(jnp.asarray(state.theta + share * error)), float)
+        for share in (0.0, -width, width, 1e-3)
     )
     out = []
     for j, name in enumerate(learned.names):
-        free = learned.quantities[j].label.kind.startswith(NEEDS_NO_IMPACT)
+        free = learned.quantities[j].label.kind not in CONTACTS
         enough = free or tells[j] >= LEAST_IMPACTS
         verdict: Verdict = "identified" if enough and error[j] <= TOLD * scale[j] else "not identified"
         size = abs(beyond[j] - values[j]) / 1e-3 if not found.at_bound[j] else (upper[j] - lower[j]) / width
@@ -235,4 +237,4 @@ def _bound(shooting: Shooting, state: State, j: int, way: float) -> float | None
         good, bad = (good, middle) if is_worse(middle) else (middle, bad)
     theta = state.theta.copy()
     theta[j] = bad
-    return float(np.asarray(learned.physical(theta))[j])
+    return float(np.asarray(learned.physical(jnp.asarray(theta)))[j])

@@ -20,6 +20,8 @@ LEAST = 4
 """Fewer do not tell a parabola and its error."""
 DOUBT = 6.0
 """Standard errors by which a sample must be missed to show a kink."""
+NEIGHBOURS = 2
+"""Kinks found forward and backward that are so many samples apart are one."""
 ROOM = 3
 """Samples of free motion that a window has at least at either end."""
 FLOOR = 1e-9
@@ -98,10 +100,13 @@ def survey(observations: Observations) -> Survey:
     reach = max(float(np.nanmax(x) - np.nanmin(x)) for _, x in tracks)
     floor = FLOOR * reach
     noise = np.maximum(_noise([(t, x, np.zeros(0, int)) for t, x in tracks], robust=True), floor)
+    misses = [_misses(time, x) for time, x in tracks]
     for _ in range(2):
-        found = [(t, x, _kinks(t, x, noise)) for t, x in tracks]
+        found = [(t, x, _kinks(missed, noise)) for (t, x), missed in zip(tracks, misses, strict=True)]
         noise = np.maximum(_noise(found, robust=False), floor)
-    places = [place for t, x, kinks in found for k in kinks if (place := _place(t, x, k, kinks, noise)) is not None]
+    places = [
+        place for t, x, kinks in found for k in kinks.tolist() if (place := _place(t, x, k, kinks, noise)) is not None
+    ]
     return Survey(tuple(Track(*one) for one in found), noise, floor, np.array(places).reshape(-1, 2), step)
 
 
@@ -148,10 +153,10 @@ def _clean(part: list[float], dof: int) -> float:
     return float(np.mean(values[values <= limit]))
 
 
-def _missed(time: np.ndarray, x: np.ndarray, noise: float) -> Float[np.ndarray, "M T 2"]:
-    """By how many standard errors samples k and k + 1 are missed by the parabola through the m samples before k.
+def _missed(time: np.ndarray, x: np.ndarray) -> Float[np.ndarray, "M T 2"]:
+    """Errors of positions (m) at which samples k and k + 1 are missed by just a standard error.
 
-    For m from `LEAST` to `REACH`; infinite where there are not so many.
+    By the parabola through the m samples before k, for m from `LEAST` to `REACH`; infinite where there are not so many.
     """
     count, d = x.shape
     out = np.full((REACH - LEAST + 1, count, 2), np.inf)
@@ -160,32 +165,56 @@ def _missed(time: np.ndarray, x: np.ndarray, noise: float) -> Float[np.ndarray, 
         rows = k[:, None] - m + np.arange(m)
         scale = time[k] - time[rows[:, 0]]
         design = ((time[rows] - time[k, None]) / scale[:, None])[..., None] ** np.arange(3)
-        inverse = np.linalg.pinv(np.einsum("kma,kmb->kab", design, design))
+        inverse = np.linalg.inv(np.einsum("kma,kmb->kab", design, design))
         fit = np.einsum("kab,kmb,kmd->kad", inverse, design, x[rows])
         for ahead in range(2):
             j = k[: len(k) - ahead]
             at = ((time[j + ahead] - time[j]) / scale[: len(j)])[:, None] ** np.arange(3)
             off = x[j + ahead] - np.einsum("ka,kad->kd", at, fit[: len(j)])
             spread = 1 + np.maximum(np.einsum("ka,kab,kb->k", at, inverse[: len(j)], at), 0)
-            out[m - LEAST, j, ahead] = np.linalg.norm(off, axis=1) / (noise * np.sqrt(d * spread))
+            out[m - LEAST, j, ahead] = np.linalg.norm(off, axis=1) / np.sqrt(d * spread)
     out[:, count - 1, 1] = np.inf  # nothing comes after the last
     return out
 
 
-def _kinks(time: np.ndarray, x: np.ndarray, noise: np.ndarray) -> Int[np.ndarray, " K"]:
-    """Samples after which a point's motion has a kink: the next two samples are missed."""
+class _Misses(NamedTuple):
+    """Of each point: the samples in which it was seen, and how much these are missed by, forward and backward."""
+
+    rows: list[np.ndarray]
+    forward: list[np.ndarray]
+    backward: list[np.ndarray]
+
+
+def _misses(time: np.ndarray, x: np.ndarray) -> _Misses:
+    rows = [np.flatnonzero(np.isfinite(x[:, p, 0])) for p in range(x.shape[1])]
+    forward = [_missed(time[r], x[r, p]) for p, r in enumerate(rows)]
+    backward = [_missed(-time[r][::-1], x[r, p][::-1]) for p, r in enumerate(rows)]
+    return _Misses(rows, forward, backward)
+
+
+def _kinks(misses: _Misses, noise: np.ndarray) -> Int[np.ndarray, " K"]:
+    """Samples after which a point's motion has a kink: the next two samples are missed.
+
+    Looked for backward too, which shows those that come before there is a parabola; of two neighbours the first stays.
+    """
     found: set[int] = set()
-    for p in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[:, p, 0]))
-        missed = _missed(time[rows], x[rows, p], noise[p]) > DOUBT
-        begin, k = 0, LEAST
-        while k < len(rows):
-            if missed[min(k - begin, REACH) - LEAST, k].all():
-                found.add(int(rows[k - 1]))
-                begin, k = k, k + LEAST
-            else:
-                k += 1
+    for rows, ahead, back, size in zip(*misses, noise, strict=True):
+        forward = _one_way(ahead > DOUBT * size)
+        backward = [len(rows) - 2 - k for k in _one_way(back > DOUBT * size)]
+        found |= {int(rows[k]) for k in forward}
+        found |= {int(rows[k]) for k in backward if not any(abs(k - other) <= NEIGHBOURS for other in forward)}
     return np.array(sorted(found), int)
+
+
+def _one_way(missed: Bool[np.ndarray, "M T 2"]) -> list[int]:
+    found, begin, k = [], 0, LEAST
+    while k < missed.shape[1]:
+        if missed[min(k - begin, REACH) - LEAST, k].all():
+            found.append(k - 1)
+            begin, k = k, k + LEAST
+        else:
+            k += 1
+    return found
 
 
 def _place(time, x, k: int, kinks, noise) -> tuple[float, float] | None:
@@ -232,9 +261,9 @@ def windows_of(found: Survey, impacts: int | None) -> Windows:
 
 def _cuts(track: Track, impacts: int | None) -> list[tuple[int, int]]:
     """First and last sample of each window."""
-    last, kinks = len(track.time) - 1, list(track.kinks)
+    last, kinks = len(track.time) - 1, track.kinks.tolist()
     first = 0
-    while kinks and kinks[0] - first + 1 < ROOM:  # too little motion before it
+    while kinks and kinks[0] - first + 1 < 2 * ROOM:  # too little motion before it
         first = kinks.pop(0) + 1
     groups: list[list[int]] = []
     for k in kinks:
