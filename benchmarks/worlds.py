@@ -141,14 +141,14 @@ def _hit(pucks: Pucks, x, v, contact: int):
     """Velocities after the impact `contact`."""
     v = v.copy()
     pair = contact == 8
-    kind = 0 if pair else 1
+    kind, body = (0, 0) if pair else (1, contact // 4)
     mu, e = pucks.friction[kind], pucks.restitution[kind]
     if pair:
         normal = (x[0] - x[1]) / np.linalg.norm(x[0] - x[1])
         mass = 1 / (1 / pucks.masses[0] + 1 / pucks.masses[1])
         meeting = v[0] - v[1]
     else:
-        normal, body = WALLS[contact % 4], contact // 4
+        normal = WALLS[contact % 4]
         mass, meeting = pucks.masses[body], v[body]
     along = meeting - (meeting @ normal) * normal
     pressing = -(1 + e) * mass * (meeting @ normal)

@@ -125,10 +125,8 @@ def verdict_first(console: Console, fit: Fit) -> None:
 def estimates_table(estimates: Sequence[Estimate]) -> Table:
     """Quantities with their intervals and verdicts."""
     table = Table(title="What the data tell")
-    for name, side in (("quantity", "left"), ("of", "left"), ("impacts", "right"), ("value +- 95 %", "right")):
-        table.add_column(name, justify=side)
-    table.add_column("unit")
-    table.add_column("told")
+    for name in ("quantity", "of", "impacts", "value +- 95 %", "unit", "told"):
+        table.add_column(name, justify="right" if name in ("impacts", "value +- 95 %") else "left")
     for one in estimates:
         half = (one.upper - one.lower) / 2
         value = f"{one.value:.{_digits(half)}f} +- {half:.1g}"

@@ -41,8 +41,10 @@ SLIDING = 0.1
 """Frictions begin at this value at most: what sticks does not tell how rough it is."""
 INSIDE = (0.2, 0.9)
 """Restitutions begin between these."""
-SHORT: tuple[Loss, ...] = ("convex",) * 3 + ("redescending",) * 3
-LONG: tuple[Loss, ...] = ("convex", *("redescending",) * 3)
+CONVEX: tuple[Loss, ...] = ("convex",)
+REDESCENDING: tuple[Loss, ...] = ("redescending",)
+SHORT: tuple[Loss, ...] = (*CONVEX * 3, *REDESCENDING * 3)
+LONG: tuple[Loss, ...] = (*CONVEX, *REDESCENDING * 3)
 LAST: tuple[Loss, ...] = ("squares",) * 3
 AT_SAMPLES = 0.05
 """Kinks that are within so much of a step of a sample are at it."""
@@ -175,11 +177,11 @@ def _by_rule(
 ) -> Told:
     begin, end = shares
     noise = np.repeat(found.noise, every.dim)
-    flow = Flow(learned, rule)
+    flow, least = Flow(learned, rule), float(np.max(found.floor / noise)) ** 2
     short = windows_of(found, 1)
 
     def shooting_of(windows: Windows) -> Shooting:
-        return Shooting(flow, windows, noise, ~held[windows.trajectory])
+        return Shooting(flow, windows, noise, ~held[windows.trajectory], least)
 
     def part(a: float, b: float, text: str, steps: int):
         a, b = (begin + share * (end - begin) for share in (a, b))
@@ -240,7 +242,7 @@ def _those_that_fit(
 
 def _told(shooting: Shooting, state: State, found: Survey, held: Bool[np.ndarray, " N"], rule: ImpactRule) -> Told:
     learned, points = shooting.flow.learned, len(found.noise)
-    share = noise_share(shooting, state, found.floor)
+    share = noise_share(shooting, state)
     of = spread(shooting, state, shooting.windows.trajectory, share)
     rows = held[shooting.windows.trajectory] if held.any() else shooting.used
     kept = shooting.kept

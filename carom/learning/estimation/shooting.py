@@ -54,21 +54,28 @@ class State(NamedTuple):
 
 
 class Shooting:
-    """Windows to fit. `noise`: errors of each number (R,); `used`: windows that tell of theta, the others only fit."""
+    """Windows to fit. `noise`: errors of each number (R,); `used`: windows that tell of theta, the others
+    only fit; `least`: a mean squared residual that is rounding."""
 
     def __init__(
-        self, flow: Flow, windows: Windows, noise: Float[np.ndarray, " R"], used: Bool[np.ndarray, " W"] | None = None
+        self,
+        flow: Flow,
+        windows: Windows,
+        noise: Float[np.ndarray, " R"],
+        used: Bool[np.ndarray, " W"] | None = None,
+        least: float = 1.0,
     ):
-        self.flow, self.windows, self.noise = flow, windows, noise
+        self.flow, self.windows, self.noise, self.least = flow, windows, noise, least
         self.used = np.ones(len(windows.x), bool) if used is None else used
         self.seen = np.isfinite(windows.x)
         self.numbers = self.seen.sum(axis=2)
         self.kept = self.numbers > 0
+        self.fits = np.ones(len(windows.x), bool)
 
     def keep_what_fits(self, state: State) -> None:
         """Leave out, of plain sums of squares, windows that do not fit, and single samples that are far off."""
         each = self.of_windows(state)
-        typical = max(float(np.median(each[self.used])), 1e-300)
+        typical = max(float(np.median(each[self.used])), self.least)
         self.fits = each <= LOST * typical
         near = self.distance(state) <= OUTLIER**2 * typical
         self.kept = (self.numbers > 0) & self.fits[:, None] & near

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from carom.learning.estimation.shooting import LOST, Shooting, State, shoot
+from carom.simulation.impact import ImpactRule
 
 Verdict = Literal["identified", "bounded below", "bounded above", "not identified", "misfit"]
 
@@ -54,14 +55,14 @@ class Fit:
     chi2: float
     missed: float
     by_channel: dict[str, dict[str, float | None]]
-    impact_rule: str
+    impact_rule: ImpactRule
     noise: list[float]
     windows: int
     impacts: int
     alike: list[list[str]]
 
 
-def noise_share(shooting: Shooting, state: State, floor: float) -> float:
+def noise_share(shooting: Shooting, state: State) -> float:
     """By which mean squares are divided that are left where there is no noise: the data's own, if it is less.
 
     Errors were found from parabolas; where motion is none, what is left before impacts is what positions err by. It is
@@ -71,8 +72,7 @@ def noise_share(shooting: Shooting, state: State, floor: float) -> float:
     before = shooting.windows.before & rows[:, None]
     total, free = _sums(shooting, state)
     left = total[before].sum() / max(free[before].sum(), 1e-300)
-    least = float(np.max(floor / shooting.noise)) ** 2
-    return float(np.clip(left, least, 1.0))
+    return float(np.clip(left, shooting.least, 1.0))
 
 
 def _sums(shooting: Shooting, state: State) -> tuple[Float[np.ndarray, "W T R"], Float[np.ndarray, "W T R"]]:

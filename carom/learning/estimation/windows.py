@@ -101,6 +101,7 @@ def survey(observations: Observations) -> Survey:
     floor = FLOOR * reach
     noise = np.maximum(_noise([(t, x, np.zeros(0, int)) for t, x in tracks], robust=True), floor)
     misses = [_misses(time, x) for time, x in tracks]
+    found = []
     for _ in range(2):
         found = [(t, x, _kinks(missed, noise)) for (t, x), missed in zip(tracks, misses, strict=True)]
         noise = np.maximum(_noise(found, robust=False), floor)
