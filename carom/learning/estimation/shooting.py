@@ -54,7 +54,7 @@ class State(NamedTuple):
 
 
 class Shooting:
-    """Windows to fit. `noise`: errors of each number (R,); `used`: windows that tell of theta, the others
+    """Windows to fit. `noise`: errors of each number (R,), beside those of times; `used`: windows that tell of theta, the others
     only fit; `least`: a mean squared residual that is rounding."""
 
     def __init__(
@@ -65,7 +65,8 @@ class Shooting:
         used: Bool[np.ndarray, " W"] | None = None,
         least: float = 1.0,
     ):
-        self.flow, self.windows, self.noise, self.least = flow, windows, noise, least
+        self.flow, self.windows, self.least = flow, windows, least
+        self.noise = np.sqrt(noise**2 + windows.timing**2)  # (W, T, R)
         self.used = np.ones(len(windows.x), bool) if used is None else used
         self.seen = np.isfinite(windows.x)
         self.numbers = self.seen.sum(axis=2)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from carom.simulation.clock import digit_of
 from carom.simulation.observations import Observations
 
 REACH = 8
@@ -24,6 +25,8 @@ NEIGHBOURS = 2
 """Kinks found forward and backward that are so many samples apart are one."""
 ROOM = 3
 """Samples of free motion that a window has at least at either end."""
+SHARE = 0.1
+"""Errors of positions that are left beside those of their times are this share of all at least."""
 FLOOR = 1e-9
 """Errors of positions, as a share of how far the motion reaches, are not taken to be less: rounding, amplified."""
 GAP = 1.5
@@ -33,13 +36,15 @@ GAP = 1.5
 class Windows(NamedTuple):
     """Windows of trajectories, padded to the longest with NaN.
 
-    `steps` (s) from each time to the next, `x` seen there (NaN where not); `before`: times before the first kink;
+    `steps` (s) from each time to the next, `x` seen there (NaN where not), and what errors of their times make of them
+    (`timing`, m); `before`: times before the first kink;
     `kink`: steps in which there is one; `start`: positions and velocities to begin with; `first`: the sample that a
     window begins with.
     """
 
     steps: Float[np.ndarray, "W L"]
     x: Float[np.ndarray, "W T R"]
+    timing: Float[np.ndarray, "W T R"]
     before: Bool[np.ndarray, "W T"]
     kink: Bool[np.ndarray, "W L"]
     start: Float[np.ndarray, "W 2 n d"]
@@ -59,7 +64,13 @@ class Windows(NamedTuple):
             width = [(0, 0), (0, wide - part.shape[1])] + [(0, 0)] * (part.ndim - 2)
             return np.pad(part, width, constant_values=fill)
 
-        wide = {"steps": (most, np.nan), "x": (most + 1, np.nan), "before": (most + 1, False), "kink": (most, False)}
+        wide = {
+            "steps": (most, np.nan),
+            "x": (most + 1, np.nan),
+            "timing": (most + 1, 0.0),
+            "before": (most + 1, False),
+            "kink": (most, False),
+        }
         return cls(
             **{
                 name: np.concatenate(
@@ -71,10 +82,12 @@ class Windows(NamedTuple):
 
 
 class Track(NamedTuple):
-    """One trajectory: its times (s), positions (NaN where not seen), and the samples after which there is a kink."""
+    """One trajectory: its times (s), positions (NaN where not seen), what errors of times make of these (m), and the
+    samples after which there is a kink."""
 
     time: Float[np.ndarray, " T"]
     x: Float[np.ndarray, "T n d"]
+    timing: Float[np.ndarray, "T n d"]
     kinks: Int[np.ndarray, " K"]
 
 
@@ -99,16 +112,35 @@ def survey(observations: Observations) -> Survey:
     step = float(np.median(np.concatenate([np.diff(time) for time, _ in tracks])))
     reach = max(float(np.nanmax(x) - np.nanmin(x)) for _, x in tracks)
     floor = FLOOR * reach
+    digit = digit_of(observations.time, np.isfinite(observations.time))
+    timing = [_timing(time, x, digit) for time, x in tracks]
     noise = np.maximum(_noise([(t, x, np.zeros(0, int)) for t, x in tracks], robust=True), floor)
     misses = [_misses(time, x) for time, x in tracks]
     found = []
     for _ in range(2):
         found = [(t, x, _kinks(missed, noise)) for (t, x), missed in zip(tracks, misses, strict=True)]
         noise = np.maximum(_noise(found, robust=False), floor)
-    places = [
-        place for t, x, kinks in found for k in kinks.tolist() if (place := _place(t, x, k, kinks, noise)) is not None
-    ]
-    return Survey(tuple(Track(*one) for one in found), noise, floor, np.array(places).reshape(-1, 2), step)
+    places = [_place(t, x, k, kinks, noise) for t, x, kinks in found for k in kinks.tolist()]
+    places = [place for place in places if place is not None]
+    by_time = np.nanmean(np.concatenate(timing) ** 2, axis=(0, 2))
+    own = np.sqrt(np.maximum(noise**2 - by_time, np.maximum(floor, SHARE * noise) ** 2))
+    return Survey(
+        tuple(Track(t, x, off, kinks) for (t, x, kinks), off in zip(found, timing, strict=True)),
+        own,
+        floor,
+        np.array(places).reshape(-1, 2),
+        step,
+    )
+
+
+def _timing(time: np.ndarray, x: np.ndarray, digit: float) -> Float[np.ndarray, "T n d"]:
+    """What rounding of times to a digit makes of positions: how far they move within it, by a uniform error."""
+    out = np.zeros_like(x)
+    for p in range(x.shape[1]):
+        rows = np.flatnonzero(np.isfinite(x[:, p, 0]))
+        if len(rows) > 1:
+            out[rows, p] = np.abs(np.gradient(x[rows, p], time[rows], axis=0)) * digit / np.sqrt(12)
+    return out
 
 
 def _design(time: np.ndarray, order: int) -> np.ndarray:
@@ -295,11 +327,13 @@ def _window(found: Survey, track: Track, number: int, first: int, last: int) -> 
     at = np.concatenate([[0], np.cumsum(pieces)])
     there = np.full((len(steps) + 1, x[0].size), np.nan)
     there[at] = x.reshape(len(x), -1)
+    timing = np.zeros_like(there)
+    timing[at] = track.timing[first : last + 1].reshape(len(x), -1)
     kink = np.zeros(len(steps), bool)
     for k in inside:
         kink[at[k] : at[k + 1]] = True
     before = np.arange(len(steps) + 1) <= (at[inside[0]] if len(inside) else len(steps))
-    one = steps, there, before, kink, start, np.array(number), np.array(first)
+    one = steps, there, timing, before, kink, start, np.array(number), np.array(first)
     return Windows(*(part[None] for part in one))
 
 
