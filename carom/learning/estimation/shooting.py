@@ -54,8 +54,11 @@ class State(NamedTuple):
 
 
 class Shooting:
-    """Windows to fit. `noise`: errors of each number (R,), beside those of times; `used`: windows that tell of theta, the others
-    only fit; `least`: a mean squared residual that is rounding."""
+    """Windows to fit.
+
+    `noise`: errors of each number (R,), beside those of times; `used`: windows that tell of theta, the others only fit;
+    `least`: a mean squared residual that is rounding.
+    """
 
     def __init__(
         self,
