@@ -65,8 +65,14 @@ def learn_by_estimator(
         held = None if test is None else load_observations(test, chosen.system)
         progress.say(f"learning {', '.join(learn)} from {observations.n_trajectories} trajectories")
 
+        part = ""
+
         def say(text: str, share: float) -> None:
+            nonlocal part
             progress.update(int(100 * share), text)
+            if (now := text.split(":")[0]) != part:
+                part = now
+                progress.say(text)
 
         told = estimate(chosen.system, observations, learn, test=held, seed=seed, say=say)
     if chosen.source is not None:

@@ -82,7 +82,6 @@ class Work:
     def of(self, text: str, begin: float, end: float, steps: int) -> Callable[[float], None]:
         """What is called after each of about so many steps of a part of the work."""
         done = 0
-        self.say(text, begin)
 
         def each(left: float) -> None:
             nonlocal done
@@ -189,6 +188,7 @@ def _by_rule(
 
     shooting = shooting_of(short)
     require(bool(shooting.used.any()), "the observations have no window with free motion to learn from.")
+    work.say(f"compiling, for a minute or two (impacts by the rule {rule!r})", begin)
     state = shoot(shooting, theta, short.start, SHORT, each=part(0.0, 0.6, "windows of an impact each", len(SHORT)))
     state = _begun_again(shooting, state, shooting_of)
     longer = windows_of(found, None)
