@@ -7,10 +7,15 @@ import pytest
 
 import carom
 from benchmarks.worlds import Pucks, Seen, observe
-from carom.cli.estimation import estimates_table, report_of, verdict_first
+from carom.cli.estimation import estimates_table, is_for_estimator, names_to_learn, report_of, verdict_first
+from carom.cli.main import main
+from carom.cli.systems import Chosen
 from carom.errors import CaromError
+from carom.learning.config import LearnConfig
 from carom.learning.estimation.estimate import estimate
 from carom.learning.estimation.windows import survey, windows_of
+from carom.learning.model_file import load_model_into
+from carom.learning.run import RunFolder
 from carom.simulation.observations import Observations
 
 TRUE = Pucks(friction=(0.17, 0.08), restitution=(0.82, 0.65), field=(0.1, -0.3))
@@ -183,3 +188,52 @@ def test_drag_that_nobody_told_is_a_misfit(exact):
     assert not told.fit.explained
     assert {one.verdict for one in told.estimates} == {"misfit"}
     assert told.fit.chi2 > 2
+
+
+FILE = """
+import carom
+
+walls = [((0.0, 0.0), (1.0, 0.0)), ((1.002, 0.0), (-1.0, 0.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (0.0, -1.0))]
+system = carom.System(
+    [carom.PointMass(0.1, 0.1), carom.PointMass(0.1, 0.149)],
+    contacts=[carom.DiskDisk([(0, 1)])] + [carom.DiskPlane([0, 1], *wall, property=1) for wall in walls],
+    friction=[0.3, 0.3],
+    restitution=[0.5, 0.5],
+    dim=2,
+)
+"""
+
+
+@pytest.mark.slow
+def test_command_learns_from_positions_and_says_the_verdict_first(exact, tmp_path, capsys):
+    world = observe(TRUE, trajectories=40, samples=80, noise=2e-4, seed=6)
+    np.savez(tmp_path / "seen.npz", x=world.x, time=world.time)
+    (tmp_path / "box.py").write_text(FILE)
+    file, data, run = (str(tmp_path / name) for name in ("box.py", "seen.npz", "run"))
+    main(["learn", file, "--data", data, "--learn", *LEARN, "--out", run])
+    said = capsys.readouterr()
+    assert said.out.index("The learned system explains the data to") < said.out.index("What the data tell")
+    assert "compiling" in said.out + said.err
+    report = RunFolder.open(run).read_json("report.json")
+    assert report["fit"]["explained"]
+    assert report["fit"]["impact_rule"] == "event"
+    learned = {one["name"]: one["value"] for one in report["estimates"]}
+    main(["evaluate", run])  # the file of the model has all that was learned: the wall, the radius, the field
+    assert "Predictions of" in capsys.readouterr().out
+    system = load_model_into(tmp_path / "run" / "model.carom", box(TRUE))
+    assert float(system.bodies[1].radius) == pytest.approx(learned["radius:1"], abs=1e-12)
+    assert float(system.contacts[2].point[0]) == pytest.approx(-learned["plane:1"], abs=1e-12)
+
+
+def test_data_with_velocities_and_nothing_said_are_for_the_trainer(tmp_path):
+    world = observe(TRUE, trajectories=3, samples=20)
+    chosen = Chosen("box.py", box(TRUE), b"")
+    default = LearnConfig.learn
+    np.savez(tmp_path / "x.npz", x=world.x, time=world.time)
+    np.savez(tmp_path / "xv.npz", x=world.x, v=np.zeros_like(world.x), time=world.time)
+    assert is_for_estimator(tmp_path / "x.npz", default, default, chosen)
+    assert not is_for_estimator(tmp_path / "xv.npz", default, default, chosen)
+    assert is_for_estimator(tmp_path / "xv.npz", ("friction", "radius:1"), default, chosen)
+    assert not is_for_estimator(tmp_path / "xv.npz", ("mass", "potential"), default, chosen)
+    assert not is_for_estimator(None, ("friction",), default, chosen)
+    assert names_to_learn(default, default, chosen) == ("friction", "restitution", "mass", "gravity")
