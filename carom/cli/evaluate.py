@@ -64,9 +64,11 @@ class Evaluate:
             truth=chosen.truth,
             formulation=header["formulation"],
             compensation_steps=header["compensation_steps"],
+            impact=header["impact"],
         )
         console = Console()
-        found = what_is_told(system, test, config, console)
+        # What was estimated from positions is told in the run's own report.
+        found = None if config.get("estimated") else what_is_told(system, test, config, console)
         told = found and dataclasses.asdict(found)
         run.write_json("evaluation.json", {"data": str(self.data or TEST_DATA), **measures, "identification": told})
         with theme("dark" if self.dark else "light"):

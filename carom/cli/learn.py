@@ -16,6 +16,7 @@ import carom
 from carom.atomic import write_whole
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
+from carom.cli.estimation import is_for_estimator, learn_by_estimator, names_to_learn
 from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
 from carom.cli.systems import Chosen, choose, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
@@ -130,6 +131,9 @@ class Learn:
     def _run(self, console: Console) -> None:
         chosen = self._chosen()
         truth = chosen.system
+        if self._is_for_estimator(chosen):
+            self._run_estimator(console, chosen)
+            return
         self.config.check()
         self.config.prepare(truth)
         require(
@@ -202,6 +206,21 @@ class Learn:
             highlight=False,
         )
         learn_and_measure(console, run, chosen, train, test, self.tosses)
+
+    def _is_for_estimator(self, chosen: Chosen) -> bool:
+        if can_learn_tosses(chosen.system) or self.config.model not in ("clnn", "chnn"):
+            return False
+        return is_for_estimator(self.data, self.config.learn, LearnConfig.learn, chosen)
+
+    def _run_estimator(self, console: Console, chosen: Chosen) -> None:
+        """Positions alone: start states, and the time of each impact, are estimated too."""
+        assert self.data is not None
+        require(not self.resume, "--resume goes on with a training; this takes minutes, and is begun again without it.")
+        learn = names_to_learn(self.config.learn, LearnConfig.learn, chosen)
+        folder = RunFolder.choose(self.out, f"{chosen.stem}-estimated", resume=False)
+        RunFolder.check_new(folder)
+        run = RunFolder.create(folder, {**self._description(chosen), "learn": learn, "estimated": True})
+        learn_by_estimator(console, run, chosen, self.data, self.test, learn, self.config.seed)
 
     def _toss_data(self, console: Console, chosen: Chosen) -> tuple[Recording, Recording]:
         """Tosses to learn from and to measure on: the fit needs none to validate on, so that either file will do."""

@@ -100,7 +100,13 @@ class View:
         system = load_model_into(run.path / MODEL, chosen.system)
         test = self._some(load_recording(run.path / TEST_DATA, task=chosen.task))
         compensation = header["compensation_steps"]
-        found = predict(system, test, formulation=header["formulation"], compensation_steps=compensation)
+        found = predict(
+            system,
+            test,
+            formulation=header["formulation"],
+            compensation_steps=compensation,
+            impact=header["impact"],
+        )
         pairs = [
             (true, one_of(found, k, len(true.time)))
             for k, true in enumerate(trajectory_of(test, k) for k in range(test.n_trajectories))

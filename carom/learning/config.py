@@ -26,8 +26,10 @@ class LearnConfig:
     model: Model = "clnn"
     """Constrained Lagrangian (clnn) or Hamiltonian (chnn) neural network, or a baseline: a network for the contacts
     (mlp-cd-clnn, in-cp-clnn) or for the whole step (in-cp-sp)."""
-    learn: tuple[Quantity, ...] = ("mass", "friction", "restitution", "potential")
-    """What is unknown; all else is taken from the skeleton. What a baseline's network replaces is left out."""
+    learn: tuple[str, ...] = ("mass", "friction", "restitution", "potential")
+    """What is unknown; all else is taken from the skeleton. What a baseline's network replaces is left out. Without
+    `potential`, recorded data are learned from by their positions alone, and any quantity may be named: gravity,
+    radius:1, ..."""
     epochs: int = 200
     """How often `chunks_per_epoch` chunks are drawn and learned from."""
     chunks_per_epoch: int = 800

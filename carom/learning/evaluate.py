@@ -9,7 +9,7 @@ from jaxtyping import Float
 from carom.learning.baselines import physical_quantities
 from carom.learning.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
-from carom.simulation.impact import COMPENSATION_STEPS
+from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.simulation.recording import Recording, check_system
 from carom.simulation.recording_checks import state_noise
 from carom.simulation.rollout import Trajectory, simulate
@@ -23,6 +23,7 @@ def predict(
     formulation: Formulation = "lagrangian",
     project: bool = True,
     compensation_steps: float | None = COMPENSATION_STEPS,
+    impact: ImpactRule = "step",
 ) -> Trajectory:
     """Motion of `system` from the first recorded state of each trajectory, as long as the recording.
 
@@ -37,6 +38,7 @@ def predict(
         formulation=formulation,
         project=project,
         compensation_steps=compensation_steps,
+        impact=impact,
         throw=False,
     )
 
@@ -109,12 +111,13 @@ def evaluate(
     truth: System | None = None,
     formulation: Formulation = "lagrangian",
     compensation_steps: float | None = COMPENSATION_STEPS,
+    impact: ImpactRule = "step",
 ) -> tuple[dict[str, Any], Trajectory]:
     """Measures of `system` on test recordings, and its predictions.
 
     **Arguments:** `system`, learned; `recording`, test data; `truth`, the true system where it is known, for the errors
-    of properties and the drift of the true energy; `formulation` and `compensation_steps` of the predictions, as those
-    of `simulate`.
+    of properties and the drift of the true energy; `formulation`, `compensation_steps` and `impact` of the predictions,
+    as those of `simulate`.
 
     **Returns:** a dictionary of numbers (definitions: the paper, section 5 and appendix L; the first of each pair below
     is the paper's) with
@@ -131,7 +134,9 @@ def evaluate(
     **Raises:** `CaromError` if the recording is of another system.
     """
     check_system(recording, system)
-    predicted = predict(system, recording, formulation=formulation, compensation_steps=compensation_steps)
+    predicted = predict(
+        system, recording, formulation=formulation, compensation_steps=compensation_steps, impact=impact
+    )
     relative, bounded = state_errors(recording, predicted)
     later, later_bounded = relative[:, 1:], bounded[:, 1:]
     per_trajectory = np.nanmean(later, axis=1)

@@ -15,6 +15,7 @@ from carom.checks import require
 from carom.contact.impulses import CONTACT_MODELS, ContactModel, contact_model_name, contact_model_settings
 from carom.errors import CaromError
 from carom.learning.baselines import describe_baseline, rebuild_baseline
+from carom.learning.body_quantities import gravity_path, with_field
 from carom.learning.models import NeuralPotential
 from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.system import System
@@ -47,6 +48,7 @@ def save_model(
         "dim": system.dim,
         "compensation_steps": compensation_steps,
         "impact": impact,
+        "field": gravity_path(system) is not None,
         "contact_model": {
             "name": contact_model_name(system.contact_model),
             **contact_model_settings(system.contact_model),
@@ -70,7 +72,7 @@ def save_model(
 
 
 NEEDED = {"task", "formulation", "points", "dim", "network", "sha256"}
-KEYS = NEEDED | {"compensation_steps", "impact", "contact_model", "potential", "baseline", "header_sha256"}
+KEYS = NEEDED | {"compensation_steps", "impact", "field", "contact_model", "potential", "baseline", "header_sha256"}
 """What a header may have; older files lack some."""
 
 
@@ -107,6 +109,8 @@ def load_model_into(path: str | Path, skeleton: System) -> System:
         if network is None:
             potential = eqx.tree_at(lambda p: p.network, potential, None)
         skeleton = eqx.tree_at(lambda s: s.potential, skeleton, potential)
+    elif header.get("field"):
+        skeleton = with_field(skeleton)  # a uniform field may have been learned of a system that has none
     skeleton = skeleton.with_contact_model(_contact_model(path, header) or skeleton.contact_model)
     if header.get("baseline") is not None:
         skeleton = rebuild_baseline(header["baseline"], skeleton)

@@ -1,0 +1,177 @@
+"""`carom learn FILE --data DATA --learn ...` from positions alone: the estimator on the command line."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from carom.atomic import write_whole
+from carom.cli.outcome import TEST_DATA, pictures, say_unexplained
+from carom.cli.systems import Chosen
+from carom.learning.estimation.estimate import Told, estimate
+from carom.learning.estimation.verdict import Estimate, Fit
+from carom.learning.evaluate import predict
+from carom.learning.model_file import save_model
+from carom.learning.models import mass_ratios
+from carom.learning.progress import LoopProgress
+from carom.learning.run import MODEL, REPORT, SYSTEM, TRUTH, RunFolder
+from carom.simulation.files import save_recording
+from carom.simulation.observations import Observations, load_observations
+from carom.simulation.recording import Recording
+
+BY_ITSELF = ("friction", "restitution", "mass", "gravity")
+"""What is learned of positions where nothing is said."""
+TRAINED = {"mass", "friction", "restitution", "potential"}
+"""What the trainer can learn of positions and velocities."""
+
+
+def is_for_estimator(data: Path | None, learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> bool:
+    """Whether data are learned from by the estimator: names of other quantities than the trainer's, or no velocities.
+
+    Where velocities are recorded, and nothing is said, the potential is learned too, which takes the trainer.
+    """
+    if data is None:
+        return False
+    if set(learn) - TRAINED or (tuple(learn) != tuple(default) and "potential" not in learn):
+        return True
+    return not chosen.system.links and load_observations(data).v is None and tuple(learn) == tuple(default)
+
+
+def names_to_learn(learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> tuple[str, ...]:
+    """What is asked for; by itself, all that a system with free bodies has."""
+    if tuple(learn) != tuple(default):
+        return tuple(learn)
+    one = len(chosen.system.bodies) == 1
+    return tuple(name for name in BY_ITSELF if not (one and name == "mass"))
+
+
+def learn_by_estimator(
+    console: Console,
+    run: RunFolder,
+    chosen: Chosen,
+    data: Path,
+    test: Path | None,
+    learn: Sequence[str],
+    seed: int,
+) -> None:
+    """Estimate, print and write everything."""
+    with LoopProgress("estimating, %", 100, console=console) as progress:
+        progress.say("reading the data")
+        observations = load_observations(data, chosen.system)
+        held = None if test is None else load_observations(test, chosen.system)
+        progress.say(f"learning {', '.join(learn)} from {observations.n_trajectories} trajectories")
+
+        part = ""
+
+        def say(text: str, share: float) -> None:
+            nonlocal part
+            progress.update(int(100 * share), text)
+            if (now := text.split(":")[0]) != part:
+                part = now
+                progress.say(text)
+
+        told = estimate(chosen.system, observations, learn, test=held, seed=seed, say=say)
+    if chosen.source is not None:
+        write_whole(run.path / SYSTEM, chosen.source)
+    save_model(run.path / MODEL, told.system, impact=told.fit.impact_rule)
+    run.write_json(TRUTH, None)
+    shown = shown_motions(told, held if held is not None else observations)
+    save_recording(run.path / TEST_DATA, shown)
+    run.write_json(REPORT, report_of(told))
+    verdict_first(console, told.fit)
+    console.print(estimates_table(told.estimates))
+    for names in told.fit.alike:
+        console.print(f"These data do not tell apart: {', '.join(names)}.", highlight=False)
+    predicted = predict(told.system, shown, impact=told.fit.impact_rule)
+    pictures(run, told.system, shown, predicted)
+    console.print(f"Done ({told.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
+
+
+def report_of(told: Told) -> dict[str, Any]:
+    """What `report.json` holds."""
+    system = told.system
+    return {
+        "estimates": [dataclasses.asdict(one) for one in told.estimates],
+        "fit": dataclasses.asdict(told.fit),
+        "evaluation": told.evaluation,
+        "learned": {
+            "friction": np.asarray(system.friction).tolist(),
+            "restitution": np.asarray(system.restitution).tolist(),
+            "mass_ratio": mass_ratios(system).tolist(),
+            "seconds": told.seconds,
+        },
+        "identification": None,
+    }
+
+
+def verdict_first(console: Console, fit: Fit) -> None:
+    """How well held-out windows are explained, before all else."""
+    rule = f"impacts by the rule {fit.impact_rule!r}, {fit.windows} windows that were held out"
+    if fit.explained:
+        text = f"The learned system explains the data to {np.sqrt(fit.chi2):.3g} of the noise ({rule})."
+        console.print(text, style="bold green", soft_wrap=True, highlight=False)
+        return
+    parts = {
+        f"{'before' if when == 'before' else 'after'} impacts, of point {name.removeprefix('x:')}": value
+        for name, both in fit.by_channel.items()
+        for when, value in both.items()
+        if value is not None
+    }
+    worst = max(parts, key=lambda name: parts[name], default="nowhere")
+    why = f"windows are off by {np.sqrt(fit.chi2):.3g} times the noise, mostly {worst}"
+    if fit.missed:
+        why += f"; {fit.missed:.0%} of them do not fit at all"
+    say_unexplained(console, f"{why} ({rule})")
+
+
+def estimates_table(estimates: Sequence[Estimate]) -> Table:
+    """Quantities with their intervals and verdicts."""
+    table = Table(title="What the data tell")
+    for name in ("quantity", "of", "impacts", "value +- 95 %", "unit", "told"):
+        table.add_column(name, justify="right" if name in ("impacts", "value +- 95 %") else "left")
+    for one in estimates:
+        half = (one.upper - one.lower) / 2
+        value = f"{one.value:.{_digits(half)}f} +- {half:.1g}"
+        if one.verdict == "bounded below":
+            value = f">= {one.lower:.4g}"
+        if one.verdict == "bounded above":
+            value = f"<= {one.upper:.4g}"
+        style = {"identified": None, "misfit": "yellow"}.get(one.verdict, "dim")
+        impacts = "" if one.impacts is None else str(one.impacts)
+        table.add_row(one.name, one.of, impacts, value, one.unit, one.verdict, style=style)
+    return table
+
+
+def _digits(half: float) -> int:
+    return int(np.clip(1 - np.floor(np.log10(half)), 2, 12)) if 0 < half < np.inf else 4
+
+
+def shown_motions(told: Told, observations: Observations) -> Recording:
+    """Trajectories that were held out, from the starts that were fitted, at equal steps: to look at and to predict.
+
+    Positions are those seen, between samples on straight lines; velocities, but for the first, their differences.
+    """
+    step, parts = told.step, []
+    for track in told.held:
+        last = int(np.floor((track.time[-1] - track.time[0]) / step + 1e-6))
+        if last < 4:
+            continue
+        time = step * np.arange(last + 1)
+        x = np.stack(
+            [
+                np.interp(time, (track.time - track.time[0])[seen], column[seen])
+                for column in track.x.reshape(len(track.x), -1).T
+                for seen in [np.isfinite(column)]
+            ],
+            axis=1,
+        ).reshape(last + 1, *track.x.shape[1:])
+        v = np.gradient(x, step, axis=0, edge_order=2)
+        x[0], v[0] = track.start
+        parts.append((x, v))
+    most = max(len(x) for x, _ in parts)
+    xs, vs = (np.stack([np.pad(p[k], ((0, most - len(p[k])), (0, 0), (0, 0)), "edge") for p in parts]) for k in (0, 1))
+    return Recording.of(xs, vs, dt=step, length=np.array([len(x) for x, _ in parts]))

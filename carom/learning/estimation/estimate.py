@@ -1,0 +1,286 @@
+"""The estimator: what observed motion tells of a system's quantities, with intervals and a verdict.
+
+Windows are short at first, an impact each, and then as long as there is motion: what a window of many impacts tells
+grows with each. Where a long one does not fit, its short ones stay. Some trajectories are held out: with the quantities
+held, their windows say how well the system explains such motion.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import stats
+
+from carom.checks import require
+from carom.learning.estimation.flow import Flow
+from carom.learning.estimation.shooting import Loss, Shooting, State, shoot
+from carom.learning.estimation.verdict import (
+    EXPLAINED,
+    WORST,
+    Estimate,
+    Fit,
+    estimates_of,
+    how_well,
+    noise_share,
+    spread,
+    telling,
+)
+from carom.learning.estimation.windows import Survey, Windows, survey, windows_of
+from carom.learning.quantities import Learned
+from carom.simulation.impact import ImpactRule
+from carom.simulation.observations import Observations
+from carom.system import System
+
+HELD = 0.15
+"""Share of the trajectories, or of the sessions, that is held out."""
+SLIDING = 0.1
+"""Frictions begin at this value at most: what sticks does not tell how rough it is."""
+INSIDE = (0.2, 0.9)
+"""Restitutions begin between these."""
+CONVEX: tuple[Loss, ...] = ("convex",)
+REDESCENDING: tuple[Loss, ...] = ("redescending",)
+SHORT: tuple[Loss, ...] = (*CONVEX * 3, *REDESCENDING * 3)
+LONG: tuple[Loss, ...] = (*CONVEX, *REDESCENDING * 3)
+LAST: tuple[Loss, ...] = ("squares",) * 3
+AT_SAMPLES = 0.05
+"""Kinks that are within so much of a step of a sample are at it."""
+
+
+class Held(NamedTuple):
+    """A window that was held out: its times (s), positions as seen and as explained (m), and the start of these."""
+
+    time: Float[np.ndarray, " T"]
+    x: Float[np.ndarray, "T n d"]
+    explained: Float[np.ndarray, "T n d"]
+    start: Float[np.ndarray, "2 n d"]
+
+
+class Told(NamedTuple):
+    """What observations tell: the system that explains them best, its quantities, and how well they are explained."""
+
+    system: System
+    estimates: list[Estimate]
+    fit: Fit
+    theta: Float[np.ndarray, " P"]
+    covariance: Float[np.ndarray, "P P"]
+    held: list[Held]
+    evaluation: dict[str, float | int]
+    step: float
+    seconds: float
+
+
+@dataclasses.dataclass
+class Work:
+    """Says what is done, and how far that is: `say(text, share)`."""
+
+    say: Callable[[str, float], None]
+
+    def of(self, text: str, begin: float, end: float, steps: int) -> Callable[[float], None]:
+        """What is called after each of about so many steps of a part of the work."""
+        done = 0
+
+        def each(left: float) -> None:
+            nonlocal done
+            done += 1
+            self.say(f"{text}: off by {left:.3g} times the noise", begin + (end - begin) * min(done / steps, 1.0))
+
+        return each
+
+
+def estimate(
+    system: System,
+    observations: Observations,
+    learn: Sequence[str],
+    *,
+    test: Observations | None = None,
+    impact: ImpactRule | None = None,
+    seed: int = 0,
+    say: Callable[[str, float], None] | None = None,
+) -> Told:
+    """What `observations` tell of the quantities `learn` of a system, whose own values are where it starts.
+
+    **Arguments:** `learn`, names as `Learned.chosen` takes them; `test`, observations to be explained, by default some
+    trajectories of `observations`, which are then not learned from; `impact`, the rule of impacts, by default that
+    which explains more; `say`, called with what is being done and the share of the work that is.
+
+    **Raises:** `CaromError` for names of nothing, other points than those of the system, too little motion.
+    """
+    begun = time.monotonic()
+    work = Work(say or (lambda text, share: None))
+    shape = observations.x.shape[2:]
+    require(
+        shape == (system.n_points, system.dim),
+        f"the observations have {shape[0]} points in {shape[1]}D; the system has {system.n_points} in {system.dim}D.",
+    )
+    learned = Learned.chosen(system, learn)
+    work.say("looking for impacts", 0.0)
+    held = _held_out(observations, test, seed)
+    every = observations if test is None else Observations.concatenate([observations, test])
+    found = survey(every)
+    rules: list[ImpactRule] = ["event"] if impact is None else [impact]
+    first = _by_rule(learned, every, found, held, rules[0], _first_values(learned), work, (0.02, 0.98))
+    if impact is None and not first.fit.explained and _at_samples(found):
+        start = np.where(np.isfinite(first.theta), first.theta, _first_values(learned))
+        second = _by_rule(learned, every, found, held, "step", start, work, (0.6, 0.98))
+        first = min(first, second, key=lambda told: told.fit.chi2)
+    work.say("done", 1.0)
+    return first._replace(seconds=time.monotonic() - begun)
+
+
+def _held_out(observations: Observations, test: Observations | None, seed: int) -> Bool[np.ndarray, " N"]:
+    """Which trajectories are held out: whole sessions, where there are some."""
+    count = observations.n_trajectories
+    if test is not None:
+        return np.arange(count + test.n_trajectories) >= count
+    groups = np.array(observations.group) if observations.group is not None else np.arange(count)
+    names = np.unique(groups)
+    if len(names) < 2:
+        return np.zeros(count, bool)
+    chosen = np.random.default_rng((seed, 5)).permutation(names)[: max(1, round(HELD * len(names)))]
+    return np.isin(groups, chosen)
+
+
+def _first_values(learned: Learned) -> Float[np.ndarray, " P"]:
+    theta = np.array(learned.free(), float)
+    for k, quantity in enumerate(learned.quantities):
+        if quantity.label.kind == "friction":
+            theta[k] = min(theta[k], SLIDING)
+        if quantity.label.kind == "restitution":
+            theta[k] = np.clip(theta[k], *INSIDE)
+    return theta
+
+
+def _at_samples(found: Survey) -> bool:
+    """Whether kinks are at samples, by far more often than those of impacts at any time would be."""
+    place, error = found.place.T
+    sharp = error < AT_SAMPLES / 2
+    if sharp.sum() < 5:
+        return len(place) > 0  # it cannot be told
+    near = np.abs(place[sharp] - np.round(place[sharp])) < AT_SAMPLES
+    return bool(stats.binomtest(int(near.sum()), int(sharp.sum()), 2 * AT_SAMPLES).pvalue < 1e-6 and near.mean() > 0.5)
+
+
+def _by_rule(
+    learned: Learned,
+    every: Observations,
+    found: Survey,
+    held: Bool[np.ndarray, " N"],
+    rule: ImpactRule,
+    theta: Float[np.ndarray, " P"],
+    work: Work,
+    shares: tuple[float, float],
+) -> Told:
+    begin, end = shares
+    noise = np.repeat(found.noise, every.dim)
+    flow, least = Flow(learned, rule), float(np.max(found.floor / noise)) ** 2
+    short = windows_of(found, 1)
+
+    def shooting_of(windows: Windows) -> Shooting:
+        return Shooting(flow, windows, noise, ~held[windows.trajectory], least)
+
+    def part(a: float, b: float, text: str, steps: int):
+        a, b = (begin + share * (end - begin) for share in (a, b))
+        return work.of(f"{text} (impacts by the rule {rule!r})", a, b, steps)
+
+    shooting = shooting_of(short)
+    require(bool(shooting.used.any()), "the observations have no window with free motion to learn from.")
+    work.say(f"compiling, for a minute or two (impacts by the rule {rule!r})", begin)
+    state = shoot(shooting, theta, short.start, SHORT, each=part(0.0, 0.6, "windows of an impact each", len(SHORT)))
+    state = _begun_again(shooting, state, shooting_of)
+    longer = windows_of(found, None)
+    wide = shooting_of(longer)
+    each = part(0.6, 0.8, "longer windows", len(LONG))
+    there = shoot(wide, state.theta, _starts(short, state, longer), LONG, each=each)
+    there = _begun_again(wide, there, shooting_of)
+    windows, z = _those_that_fit(wide, there, short, state)
+    shooting = shooting_of(windows)
+    state = shooting.at(there.theta, z)
+    shooting.keep_what_fits(state)
+    state = shoot(shooting, state.theta, state.z, LAST, each=part(0.8, 1.0, "standard errors", len(LAST)))
+    return _told(shooting, state, found, held, rule)
+
+
+def _begun_again(shooting: Shooting, state: State, shooting_of: Callable[[Windows], Shooting]) -> State:
+    """With starts of windows that do not fit found anew, from the samples before their first impacts.
+
+    They may have been led astray while the quantities were not known yet.
+    """
+    shooting.keep_what_fits(state)
+    lost = np.flatnonzero(~shooting.fits)
+    if not len(lost):
+        return state
+    part = shooting_of(shooting.windows.take(lost))
+    there = shoot(part, state.theta, part.windows.start, ("redescending",) * 4, held=True)
+    better = part.of_windows(there) < shooting.of_windows(state)[lost]
+    z = state.z.copy()
+    z[lost[better]] = there.z[better]
+    return shooting.at(state.theta, z)
+
+
+def _starts(short: Windows, state: State, longer: Windows) -> Float[np.ndarray, "W 2 n d"]:
+    """Starts of longer windows: as they were fitted to the first of their short ones."""
+    where = {key: k for k, key in enumerate(zip(short.trajectory.tolist(), short.first.tolist(), strict=True))}
+    keys = zip(longer.trajectory.tolist(), longer.first.tolist(), strict=True)
+    index = np.array([where.get(key, -1) for key in keys])
+    return np.where((index >= 0)[:, None, None, None], state.z[index], longer.start)
+
+
+def _those_that_fit(
+    wide: Shooting, there: State, short: Windows, state: State
+) -> tuple[Windows, Float[np.ndarray, "W 2 n d"]]:
+    """Long windows that fit; in place of the others, the short ones of their trajectories."""
+    wide.keep_what_fits(there)
+    rest = np.flatnonzero(np.isin(short.trajectory, wide.windows.trajectory[~wide.fits]))
+    fit = np.flatnonzero(wide.fits)
+    windows = Windows.concatenate([wide.windows.take(fit), short.take(rest)])
+    return windows, np.concatenate([there.z[fit], state.z[rest]])
+
+
+def _told(shooting: Shooting, state: State, found: Survey, held: Bool[np.ndarray, " N"], rule: ImpactRule) -> Told:
+    learned, points = shooting.flow.learned, len(found.noise)
+    share = noise_share(shooting, state)
+    of = spread(shooting, state, shooting.windows.trajectory, share)
+    rows = held[shooting.windows.trajectory] if held.any() else shooting.used
+    kept = shooting.kept
+    shooting.kept = shooting.numbers > 0
+    well = how_well(shooting, state, share, points, rows)
+    shooting.kept = kept
+    explained = well["chi2"] <= EXPLAINED and well["missed"] <= WORST
+    fit = Fit(
+        explained=explained,
+        impact_rule=rule,
+        noise=(found.noise * np.sqrt(share)).tolist(),
+        impacts=telling(shooting, state)[2],
+        alike=of.alike,
+        **well,
+    )
+    estimates = estimates_of(shooting, state, of, explained=explained)
+    system = learned.assemble(jnp.asarray(state.theta))
+    shown = [_shown(shooting, state, row) for row in np.flatnonzero(rows).tolist()]
+    return Told(system, estimates, fit, state.theta, of.covariance, shown, _evaluation(shown), found.step, 0.0)
+
+
+def _shown(shooting: Shooting, state: State, row: int) -> Held:
+    shape = state.z.shape[2:]
+    steps = shooting.windows.steps[row]
+    time = np.concatenate([[0.0], np.cumsum(steps[np.isfinite(steps)])])
+    there = np.flatnonzero(shooting.numbers[row] > 0)
+    x, explained = (part[row, there].reshape(-1, *shape) for part in (shooting.windows.x, state.motion.x))
+    return Held(time[there], x, explained, state.z[row])
+
+
+def _evaluation(held: list[Held]) -> dict[str, float | int]:
+    """Errors of positions over their sizes, by the mean over time, then over windows."""
+    errors = []
+    for window in held:
+        off, size = (np.sqrt(np.nansum(part**2, axis=(1, 2))) for part in (window.x - window.explained, window.x))
+        errors.append(float(np.mean(off / np.maximum(size, 1e-300))))
+    return {
+        "trajectories": len(held),
+        "trajectory_error": float(np.mean(errors)),
+        "trajectory_error_median": float(np.median(errors)),
+    }

@@ -1,0 +1,206 @@
+"""Motions of many windows and their derivatives, by two small programs: a step in which nothing can touch, and one.
+
+Each window goes on in its own time. Its next step is tried without contact first, all windows at once; those in which
+a gap may close wait until there are enough of them for a step with contact. So impacts cost what they cost, wherever
+they are, and windows of any length share the programs. Derivatives by the start of a window and by the quantities are
+composed from those of single steps, in forward mode.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from carom.learning.quantities import Learned
+from carom.simulation.events import closing_speed, hermite, touching
+from carom.simulation.impact import ImpactRule, Stepper
+from carom.simulation.projection import project_state
+from carom.simulation.rollout import step
+
+EVENTS = 4
+"""Most impacts within a step."""
+FREE, NEAR = 256, 64
+"""Windows that are moved together, without and with contact."""
+PLACES = 4
+"""Places on the way of a step at which gaps are looked at, before it is said that none can close."""
+MARGIN = 0.05
+"""Share of what a gap can change within a step by which it must stay open at these places."""
+
+
+class Hits(NamedTuple):
+    """Steps in which contacts changed velocities: of which window, at which step, and what that depends on."""
+
+    window: Int[np.ndarray, " H"]
+    step: Int[np.ndarray, " H"]
+    jump: Float[np.ndarray, " H"]  # m/s
+    by_theta: Float[
+        np.ndarray, "H P"
+    ]  # m/s, of velocities after it, by each free number, or of positions over the step
+    closed: Bool[np.ndarray, "H C"]  # whose gaps can have closed
+
+
+class Motion(NamedTuple):
+    """Positions of windows at their times, and the derivatives by the start and by the free numbers."""
+
+    x: Float[np.ndarray, "W T R"]
+    by_start: Float[np.ndarray, "W T R S"]
+    by_theta: Float[np.ndarray, "W T R P"]
+    hits: Hits
+
+
+def _moved(learned: Learned, theta, z, dt, rule: ImpactRule, contact: bool):
+    """States (2, n, d) after a step, and their derivatives (2 n d, 2 n d + P)."""
+
+    def one(z, theta):
+        system = learned.assemble(theta)
+        stepper = Stepper(dt=dt, impact=rule, events=EVENTS, project=bool(system.links), contact=contact)
+        out = step(system, z[0], z[1], stepper)
+        return jnp.stack([out.x, out.v])
+
+    return _with_derivatives(one, z, theta)
+
+
+def _with_derivatives(one: Callable, z, theta):
+    size = z.size
+    basis = jnp.eye(size + theta.shape[0], dtype=z.dtype)
+
+    def push(t):
+        return jax.jvp(one, (z, theta), (t[:size].reshape(z.shape), t[size:]))
+
+    after, slopes = jax.vmap(push, out_axes=(None, 0))(basis)
+    return after, slopes.reshape(len(basis), -1).T
+
+
+@eqx.filter_jit
+def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[Array, " B"], rule):
+    system = learned.assemble(theta)
+
+    def one(z, dt):
+        after, slopes = _moved(learned, theta, z, dt, rule, contact=False)
+        if not system.contacts:
+            return after, slopes, jnp.zeros(0, bool)
+        start, end = (z[0], z[1]), (after[0], after[1])
+        fastest, travel = closing_speed(system, start, end) * dt, system.travel()
+        shares = jnp.linspace(0, 1, PLACES + 1)
+        gaps = jax.vmap(lambda s: system.gaps(hermite(start, end, dt, s * dt)[0]))(shares)
+        close = jnp.min(gaps, axis=0) <= MARGIN * fastest + touching(system, z[0])
+        far = (fastest > travel) & (travel > 0) & (gaps[0] <= 2 * fastest)
+        return after, slopes, close | far
+
+    return jax.vmap(one)(z, dt)
+
+
+@eqx.filter_jit
+def _contact_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[Array, " B"], rule):
+    return jax.vmap(lambda z, dt: _moved(learned, theta, z, dt, rule, contact=True))(z, dt)
+
+
+@eqx.filter_jit
+def _starts(learned: Learned, theta, z: Float[Array, "W 2 n d"]):
+    """Starts brought onto the constraints."""
+
+    def one(z, theta):
+        system = learned.assemble(theta)
+        return jnp.stack(project_state(system.constraints, z[0], z[1], system.inverse_mass_matrix(), steps=3))
+
+    return jax.vmap(lambda z: _with_derivatives(one, z, theta))(z)
+
+
+def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+    return rows[np.arange(size).clip(max=len(rows) - 1)]
+
+
+class Flow:
+    """How windows move: the quantities learned, and the rule of impacts."""
+
+    def __init__(self, learned: Learned, rule: ImpactRule):
+        self.learned, self.rule = learned, rule
+
+    def __call__(
+        self,
+        theta: Float[np.ndarray, " P"],
+        z: Float[np.ndarray, "W 2 n d"],
+        steps: Float[np.ndarray, "W L"],
+    ) -> Motion:
+        """Positions (W, L + 1, n d) at the times that `steps` (s) lead to; NaN steps are none, behind the others."""
+        count, most = steps.shape
+        size, P = z[0].size, len(theta)
+        there = jnp.asarray(theta)
+        state = np.array(z, float)
+        slopes = np.zeros((count, size, size + P))
+        slopes[:, :, :size] = np.eye(size)
+        if self.learned.skeleton.links:
+            for rows in _batches(np.arange(count), FREE):
+                new, by = _starts(self.learned, there, jnp.asarray(state[_padded(rows, FREE)]))
+                state[rows], slopes[rows] = np.asarray(new)[: len(rows)], np.asarray(by)[: len(rows)]
+        half = size // 2
+        x = np.zeros((count, most + 1, half))
+        by = np.zeros((count, most + 1, half, size + P))
+        x[:, 0], by[:, 0] = state[:, 0].reshape(count, half), slopes[:, :half]
+        length = np.isfinite(steps).sum(axis=1)
+        at = np.zeros(count, int)
+        waiting = np.zeros(count, bool)
+        closed = np.zeros((count, self.learned.skeleton.n_candidates), bool)
+        alone = np.zeros((count, half))
+        hits: list[tuple] = []
+
+        def commit(rows, new, own):
+            state[rows] = new
+            slopes[rows] = own[:, :, :size] @ slopes[rows]
+            slopes[rows, :, size:] += own[:, :, size:]
+            at[rows] += 1
+            x[rows, at[rows]], by[rows, at[rows]] = state[rows, 0].reshape(-1, half), slopes[rows, :half]
+
+        while True:
+            going = np.flatnonzero((at < length) & ~waiting)
+            for rows in _batches(going, FREE):
+                padded = _padded(rows, FREE)
+                out = _free_steps(
+                    self.learned, there, jnp.asarray(state[padded]), jnp.asarray(steps[padded, at[padded]]), self.rule
+                )
+                new, own, near = (np.asarray(a)[: len(rows)] for a in out)
+                touch = near.any(axis=1)
+                waiting[rows[touch]], closed[rows[touch]] = True, near[touch]
+                alone[rows[touch]] = new[touch, 1].reshape(-1, half)
+                commit(rows[~touch], new[~touch], own[~touch])
+            queue = np.flatnonzero(waiting)
+            if not len(queue) and not len(going):
+                break
+            if len(queue) < NEAR and np.any((at < length) & ~waiting):
+                continue
+            for rows in _batches(queue, NEAR):
+                padded = _padded(rows, NEAR)
+                out = _contact_steps(
+                    self.learned, there, jnp.asarray(state[padded]), jnp.asarray(steps[padded, at[padded]]), self.rule
+                )
+                new, own = (np.asarray(a)[: len(rows)] for a in out)
+                jump = np.linalg.norm(new[:, 1].reshape(-1, half) - alone[rows], axis=1)
+                hit = jump > 1e-9 * np.linalg.norm(alone[rows], axis=1)
+                if hit.any():
+                    strength = _strength(own[hit][:, :, size:], steps[rows, at[rows]][hit])
+                    hits.append((rows[hit], at[rows][hit], jump[hit], strength, closed[rows][hit]))
+                commit(rows, new, own)
+                waiting[rows] = False
+        joined = [np.concatenate(parts) for parts in zip(*hits, strict=True)] if hits else None
+        found = Hits(*joined) if joined else _none(P, closed.shape[1])
+        return Motion(x, by[..., :size], by[..., size:], found)
+
+
+def _none(P: int, C: int) -> Hits:
+    zero = np.zeros(0, int)
+    return Hits(zero, zero, np.zeros(0), np.zeros((0, P)), np.zeros((0, C), bool))
+
+
+def _batches(rows: np.ndarray, size: int):
+    for first in range(0, len(rows), size):
+        yield rows[first : first + size]
+
+
+def _strength(by_theta: Float[np.ndarray, "H S P"], dt: Float[np.ndarray, " H"]) -> Float[np.ndarray, "H P"]:
+    half = by_theta.shape[1] // 2
+    places, speeds = (np.linalg.norm(part, axis=1) for part in (by_theta[:, :half], by_theta[:, half:]))
+    return np.maximum(places / dt[:, None], speeds)

@@ -1,0 +1,239 @@
+"""The estimator against motions that carom did not make: flights in closed form, impacts at their own time."""
+
+import json
+
+import numpy as np
+import pytest
+
+import carom
+from benchmarks.worlds import Pucks, Seen, observe
+from carom.cli.estimation import estimates_table, is_for_estimator, names_to_learn, report_of, verdict_first
+from carom.cli.main import main
+from carom.cli.systems import Chosen
+from carom.errors import CaromError
+from carom.learning.config import LearnConfig
+from carom.learning.estimation.estimate import estimate
+from carom.learning.estimation.windows import survey, windows_of
+from carom.learning.model_file import load_model_into
+from carom.learning.run import RunFolder
+from carom.simulation.observations import Observations
+
+TRUE = Pucks(friction=(0.17, 0.08), restitution=(0.82, 0.65), field=(0.1, -0.3))
+LEARN = ("friction", "restitution", "mass", "gravity", "radius:1", "plane:1")
+
+
+def box(pucks: Pucks) -> carom.System:
+    """What is told of the pucks: radii, walls, the first mass; the second radius and a wall a little wrong."""
+    walls = [((0.0, 0.0), (1.0, 0.0)), ((1.002, 0.0), (-1.0, 0.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (0.0, -1.0))]
+    return carom.System(
+        [carom.PointMass(pucks.masses[0], pucks.radii[0]), carom.PointMass(pucks.masses[0], pucks.radii[1] - 1e-3)],
+        contacts=[carom.DiskDisk([(0, 1)])] + [carom.DiskPlane([0, 1], *wall, property=1) for wall in walls],
+        friction=[0.3, 0.3],
+        restitution=[0.5, 0.5],
+        dim=2,
+    )
+
+
+def truth(pucks: Pucks) -> dict[str, float]:
+    names = ("friction:0", "friction:1", "restitution:0", "restitution:1", "gravity:x", "gravity:y")
+    values = (*pucks.friction, *pucks.restitution, *pucks.field)
+    ratio = pucks.masses[1] / pucks.masses[0]
+    return {**dict(zip(names, values, strict=True)), "mass:1": ratio, "radius:1": pucks.radii[1], "plane:1": -1.0}
+
+
+def seen(world: Seen) -> Observations:
+    return Observations.checked(world.x, world.time)
+
+
+# --- what motion shows by itself ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-3])
+def test_noise_is_found_from_the_motion(noise):
+    world = observe(TRUE, trajectories=30, samples=80, noise=noise)
+    # Some 2000 degrees of freedom for each puck: 1.6 % of its standard deviation, three times that.
+    np.testing.assert_allclose(survey(seen(world)).noise, noise, rtol=0.05)
+
+
+def test_impacts_are_found_where_motion_has_a_kink():
+    world = observe(TRUE, trajectories=20, samples=90)
+    found = survey(seen(world))
+    kinks = sum(len(track.kinks) for track in found.tracks)
+    assert abs(kinks - world.impacts) <= 0.06 * world.impacts  # two in one step show one kink
+    for track, x in zip(found.tracks, world.x, strict=True):
+        gaps = np.concatenate([x.reshape(90, 4), 1 - x.reshape(90, 4)], axis=1) - np.tile([0.1, 0.1, 0.15, 0.15], 2)
+        apart = np.linalg.norm(x[:, 0] - x[:, 1], axis=1) - 0.25
+        nearest = np.minimum(gaps.min(axis=1), apart)
+        # 5 m/s over a step of 1/120 s are as far as a puck can be from what it hits within it.
+        assert all(min(nearest[k], nearest[k + 1]) < 5 / 120 for k in track.kinks)
+
+
+def test_free_flight_has_no_kink():
+    time = np.arange(60) / 100
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(10, 1, 1, 2)) + rng.normal(size=(10, 1, 1, 2)) * time[:, None, None]
+    x = x - 4.9 * time[:, None, None] ** 2 * np.array([0.0, 1.0]) + 1e-4 * rng.normal(size=(10, 60, 1, 2))
+    found = survey(Observations.checked(x, time))
+    # 1200 samples of which two in a row would have to be missed by six standard errors.
+    assert sum(len(track.kinks) for track in found.tracks) == 0
+
+
+def test_each_sample_is_in_one_window():
+    world = observe(TRUE, trajectories=15, samples=90, noise=1e-4, missing=0.2, jitter=1e-3)
+    found = survey(seen(world))
+    for impacts in (1, 2, None):
+        windows = windows_of(found, impacts)
+        assert np.isfinite(windows.x).sum() <= np.isfinite(world.x).sum()
+        for number in np.unique(windows.trajectory):
+            own = windows.x[windows.trajectory == number]
+            values = own[np.isfinite(own)]
+            assert len(np.unique(values)) == len(values)
+
+
+def test_steps_of_windows_lead_to_the_times_of_samples():
+    world = observe(TRUE, trajectories=3, samples=50, missing=0.4, jitter=2e-3, seed=3)
+    windows = windows_of(survey(seen(world)), None)
+    for row, number in enumerate(windows.trajectory):
+        there = np.isfinite(windows.x[row]).all(axis=1)
+        time = np.concatenate([[0.0], np.nancumsum(windows.steps[row])])[there]
+        has = np.isfinite(world.x[number]).all(axis=(1, 2))
+        np.testing.assert_allclose(np.diff(time), np.diff(world.time[number, has][-len(time) :]), atol=1e-12)
+
+
+# --- what comes out -------------------------------------------------------------------------------------------------
+
+
+def test_free_motion_is_estimated_as_by_linear_least_squares():
+    rng = np.random.default_rng(1)
+    time, noise, count = np.arange(40) / 100, 1e-3, 12
+    x = rng.normal(size=(count, 1, 2)) + rng.normal(size=(count, 1, 2)) * time[:, None]
+    x = x + np.array([0.4, -9.7]) * time[:, None] ** 2 / 2 + noise * rng.normal(size=x.shape)
+    system = carom.System([carom.PointMass(1.0)], potential=carom.Gravity((0.0, -9.0)))
+    told = estimate(system, Observations.checked(x[:, :, None], time), ["gravity"])
+    held = [np.allclose(x[k, 0], window.x[0, 0]) for k in range(count) for window in told.held]
+    kept = ~np.reshape(held, (count, -1)).any(axis=1)
+    # By hand: x less its own straight line, against t^2 / 2 less its own.
+    line = np.stack([np.ones(40), time], axis=1)
+    rest = np.eye(40) - line @ np.linalg.pinv(line)
+    curve = rest @ time**2 / 2
+    by_hand = np.einsum("t,ntd->d", curve, x[kept]) / (kept.sum() * curve @ curve)
+    error = noise / np.sqrt(kept.sum() * curve @ curve)
+    found = {one.name: one for one in told.estimates}
+    for k, axis in enumerate("xy"):
+        one = found[f"gravity:{axis}"]
+        # The same minimum, but for samples of more than six standard errors, of which there are none.
+        assert abs(one.value - by_hand[k]) < 1e-3 * error
+        # The sandwich of ten trajectories is known to a quarter; it is not used where it is less.
+        assert 0.9 * error < one.standard_error < 2 * error
+        assert one.verdict == "identified"
+        assert one.impacts is None
+    assert told.fit.explained
+
+
+def test_observations_of_another_system_are_refused():
+    world = observe(TRUE, trajectories=2, samples=20)
+    with pytest.raises(CaromError, match=r"the observations have 1 points in 2D; the system has 2 in 2D"):
+        estimate(box(TRUE), Observations.checked(world.x[:, :, :1], world.time), ["friction"])
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """What exact positions tell."""
+    return estimate(box(TRUE), seen(observe(TRUE, trajectories=40, samples=80)), LEARN)
+
+
+@pytest.mark.slow
+def test_exact_positions_give_the_truth(exact):
+    true = truth(TRUE)
+    assert exact.fit.explained
+    assert exact.fit.impact_rule == "event"
+    for one in exact.estimates:
+        # Floats of positions, 1e-16 m, are multiplied by some hundred through each of a few impacts.
+        assert abs(one.value - true[one.name]) < 1e-9
+        assert one.verdict == "identified"
+        assert one.lower <= true[one.name] <= one.upper
+
+
+@pytest.mark.slow
+def test_report_is_that_of_the_contract(exact, capsys):
+    from rich.console import Console
+
+    report = json.loads(json.dumps(report_of(exact)))
+    keys = {"name", "of", "value", "standard_error", "lower", "upper", "unit", "verdict", "impacts"}
+    assert all(set(one) == keys for one in report["estimates"])
+    assert {"explained", "chi2", "by_channel", "impact_rule"} <= set(report["fit"])
+    assert report["evaluation"]["trajectory_error"] < 1e-8
+    verdict_first(Console(), exact.fit)
+    assert "explains the data" in capsys.readouterr().out
+    assert estimates_table(exact.estimates).row_count == len(exact.estimates)
+
+
+@pytest.mark.slow
+def test_noisy_positions_with_gaps_give_intervals_that_hold(exact):
+    world = observe(TRUE, trajectories=60, samples=100, noise=2e-4, missing=0.3, jitter=2e-3, decimals=4, seed=2)
+    told = estimate(box(TRUE), seen(world), LEARN)
+    true = truth(TRUE)
+    assert told.fit.explained
+    off = [(one.value - true[one.name]) / one.standard_error for one in told.estimates]
+    assert np.max(np.abs(off)) < 4  # of nine, in normal errors: one in two thousand
+    assert np.sum(np.abs(off) > 2.1) <= 2
+    half = {one.name: (one.upper - one.lower) / 2 for one in told.estimates}
+    assert max(half[name] for name in ("restitution:0", "restitution:1", "friction:0", "friction:1")) < 0.005
+
+
+@pytest.mark.slow
+def test_drag_that_nobody_told_is_a_misfit(exact):
+    slowed = Pucks(friction=TRUE.friction, restitution=TRUE.restitution, drag=0.5)
+    told = estimate(box(TRUE), seen(observe(slowed, trajectories=40, samples=80, noise=2e-4, seed=4)), LEARN)
+    assert not told.fit.explained
+    assert {one.verdict for one in told.estimates} == {"misfit"}
+    assert told.fit.chi2 > 2
+
+
+FILE = """
+import carom
+
+walls = [((0.0, 0.0), (1.0, 0.0)), ((1.002, 0.0), (-1.0, 0.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (0.0, -1.0))]
+system = carom.System(
+    [carom.PointMass(0.1, 0.1), carom.PointMass(0.1, 0.149)],
+    contacts=[carom.DiskDisk([(0, 1)])] + [carom.DiskPlane([0, 1], *wall, property=1) for wall in walls],
+    friction=[0.3, 0.3],
+    restitution=[0.5, 0.5],
+    dim=2,
+)
+"""
+
+
+@pytest.mark.slow
+def test_command_learns_from_positions_and_says_the_verdict_first(exact, tmp_path, capsys):
+    world = observe(TRUE, trajectories=40, samples=80, noise=2e-4, seed=6)
+    np.savez(tmp_path / "seen.npz", x=world.x, time=world.time)
+    (tmp_path / "box.py").write_text(FILE)
+    file, data, run = (str(tmp_path / name) for name in ("box.py", "seen.npz", "run"))
+    main(["learn", file, "--data", data, "--learn", *LEARN, "--out", run])
+    said = capsys.readouterr()
+    assert said.out.index("The learned system explains the data to") < said.out.index("What the data tell")
+    assert "compiling" in said.out + said.err
+    report = RunFolder.open(run).read_json("report.json")
+    assert report["fit"]["explained"]
+    assert report["fit"]["impact_rule"] == "event"
+    learned = {one["name"]: one["value"] for one in report["estimates"]}
+    main(["evaluate", run])  # the file of the model has all that was learned: the wall, the radius, the field
+    assert "Predictions of" in capsys.readouterr().out
+    system = load_model_into(tmp_path / "run" / "model.carom", box(TRUE))
+    assert float(system.bodies[1].radius) == pytest.approx(learned["radius:1"], abs=1e-12)
+    assert float(system.contacts[2].point[0]) == pytest.approx(-learned["plane:1"], abs=1e-12)
+
+
+def test_data_with_velocities_and_nothing_said_are_for_the_trainer(tmp_path):
+    world = observe(TRUE, trajectories=3, samples=20)
+    chosen = Chosen("box.py", box(TRUE), b"")
+    default = LearnConfig.learn
+    np.savez(tmp_path / "x.npz", x=world.x, time=world.time)
+    np.savez(tmp_path / "xv.npz", x=world.x, v=np.zeros_like(world.x), time=world.time)
+    assert is_for_estimator(tmp_path / "x.npz", default, default, chosen)
+    assert not is_for_estimator(tmp_path / "xv.npz", default, default, chosen)
+    assert is_for_estimator(tmp_path / "xv.npz", ("friction", "radius:1"), default, chosen)
+    assert not is_for_estimator(tmp_path / "xv.npz", ("mass", "potential"), default, chosen)
+    assert not is_for_estimator(None, ("friction",), default, chosen)
+    assert names_to_learn(default, default, chosen) == ("friction", "restitution", "mass", "gravity")
