@@ -221,9 +221,7 @@ def spheres(key, t: Frame) -> Scene:
             carom.DiskDisk([(0, 1)], property=2),
             carom.DiskPlane([0, 1], at, t.way(up), property=[0, 1]),
             carom.BallPlane([2, 2], jnp.stack([tip, -tip]), t.length * thin, at, t.way(up), property=1),
-            carom.BallBall(
-                [(2, 0)], jnp.stack([tip, 0 * tip])[None], t.length * jnp.array([[thin, r[0]]]), property=0
-            ),
+            carom.BallBall([(2, 0)], jnp.stack([tip, 0 * tip])[None], t.length * jnp.array([[thin, r[0]]]), property=0),
         ],
         keys[2],
         [t.state(places[i], turn[i], 4 * v[i] - 2, 8 * w[i] - 4) for i in range(3)],
@@ -257,9 +255,7 @@ def machine(key, t: Frame) -> Scene:
             carom.Angles(4, jnp.stack([axis, axis]), jnp.stack([first, second]), 0.0, 0),
         ],
         [
-            carom.CornerPlane(
-                [0], t.within(half), t.place(low * floor), t.way(floor), t.length * rounded, property=0
-            ),
+            carom.CornerPlane([0], t.within(half), t.place(low * floor), t.way(floor), t.length * rounded, property=0),
             carom.RimPlane([1], t.place((places[1] @ ramp - rim * lean + depth[1]) * ramp), t.way(ramp), property=1),
             carom.BallBall(
                 [(0, None)],

@@ -66,7 +66,8 @@ def test_a_step_is_the_same_in_every_frame_and_unit(name, model):
         both = solved & (other < 1e-8)
         allowed = np.where(least > 1e-6, 1e-9, 1e-7)
         worst = np.argmax(np.where(both, off / allowed, 0))
-        assert np.all((off <= allowed)[both]), f"{which}: scene {worst} is {off[worst]:.1e} off, eigenvalue {least[worst]:.1e}"
+        what = f"{which}: scene {worst} is {off[worst]:.1e} off, eigenvalue {least[worst]:.1e}"
+        assert np.all((off <= allowed)[both]), what
 
 
 def _two_disks_and(far: float | None):

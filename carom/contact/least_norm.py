@@ -1,8 +1,8 @@
 r"""Of all impulses that contacts may have with given modes the one of least norm. Arrays only.
 
-Where contacts are redundant (`A` is singular) many impulses `y` within the friction cones do the same. With `u = Q y + q`
-the modes of a solution (which contacts are open, stick, and slide where to) say what the others may be: a convex set `Y`,
-a product over the contacts, and a plane,
+Where contacts are redundant (`A` is singular) many impulses `y` within the friction cones do the same. With
+`u = Q y + q` the modes of a solution (which contacts are open, stick, and slide where to) say what the others may be: a
+convex set `Y`, a product over the contacts, and a plane,
 
     open        y_n = lower, |y_t| <= mu lower
     sticking    y_n >= lower, |y_t| <= mu y_n,                  u_n = 0, u_t = 0
@@ -22,8 +22,8 @@ from carom.contact.cone_algebra import dot
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
-# With E the rows of the plane, E Q = U S V^T and b = -S^-1 U^T E q, the plane is V^T y = b, and the projection is P(V a)
-# where a maximises the concave dual, of which this is the negative, with its gradient:
+# With E the rows of the plane, E Q = U S V^T and b = -S^-1 U^T E q, the plane is V^T y = b, and the projection is
+# P(V a), where a maximises the concave dual, of which this is the negative, with its gradient:
 #
 #     phi(a) = |z|^2 / 2 - |z - P(z)|^2 / 2 - b a,   z = V a;      phi' = V^T P(z) - b
 #
