@@ -31,6 +31,17 @@ def test_noise_alone_breaks_no_motion(missing, jitter, dim):
     assert len(found.time) < 1e-3 * np.isfinite(x[..., 0]).sum() + 9
 
 
+def test_each_session_has_its_own_noise():
+    """Two cameras, of which one is a hundred times better: what is noise of the other would be impacts of its own."""
+    rng = np.random.default_rng(0)
+    time = np.arange(60) / 120
+    size = np.repeat([1e-4, 1e-2], [40, 20])
+    x = (np.broadcast_to(time[:, None], (60, 60, 2)) + size[:, None, None] * rng.normal(size=(60, 60, 2)))[:, :, None]
+    apart = observed(time, x)._replace(group=("good",) * 40 + ("bad",) * 20)
+    assert len(motion_breaks(apart).time) <= 6
+    assert len(motion_breaks(observed(time, x)).time) > 20
+
+
 @pytest.mark.parametrize("rate", [60, 500])
 @pytest.mark.parametrize("forces", [0.0, 0.05])
 def test_smooth_exact_motion_does_not_break(rate, forces):
