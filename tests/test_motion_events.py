@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from carom.simulation.motion_events import motion_breaks
+from carom.simulation.motion_windows import series_of
 from carom.simulation.observations import Observations
 
 
@@ -29,6 +30,20 @@ def test_noise_alone_breaks_no_motion(missing, jitter, dim):
     found = motion_breaks(observed(time, x))
     # About one in a thousand samples at most: 12 (8), with a standard deviation of 3.
     assert len(found.time) < 1e-3 * np.isfinite(x[..., 0]).sum() + 9
+
+
+def test_each_session_has_its_own_noise():
+    """Two cameras, of which one is a hundred times better."""
+    rng = np.random.default_rng(0)
+    time = np.arange(60) / 120
+    size = np.repeat([1e-4, 1e-2], [40, 20])
+    x = (np.broadcast_to(time[:, None], (60, 60, 2)) + size[:, None, None] * rng.normal(size=(60, 60, 2)))[:, :, None]
+    apart = observed(time, x)._replace(group=("good",) * 40 + ("bad",) * 20)
+    assert len(motion_breaks(apart).time) <= 6
+    series = series_of(apart, (0,))
+    assert series is not None
+    # A median of some 1000 differences, which overlap: known to a few per cent.
+    np.testing.assert_allclose(series.unit, np.repeat(size[:, None], 2, axis=1), rtol=0.15)
 
 
 @pytest.mark.parametrize("rate", [60, 500])
