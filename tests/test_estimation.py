@@ -222,7 +222,9 @@ def test_command_learns_from_positions_and_says_the_verdict_first(exact, tmp_pat
     assert "Predictions of" in capsys.readouterr().out
     system = load_model_into(tmp_path / "run" / "model.carom", box(TRUE))
     assert float(system.bodies[1].radius) == pytest.approx(learned["radius:1"], abs=1e-12)
-    assert float(system.contacts[2].point[0]) == pytest.approx(-learned["plane:1"], abs=1e-12)
+    wall = system.contacts[2]
+    assert isinstance(wall, carom.DiskPlane)
+    assert float(wall.point[0]) == pytest.approx(-learned["plane:1"], abs=1e-12)
 
 
 def test_data_with_velocities_and_nothing_said_are_for_the_trainer(tmp_path):

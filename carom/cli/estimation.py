@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
@@ -14,17 +16,19 @@ from carom.cli.outcome import TEST_DATA, pictures, say_unexplained
 from carom.cli.systems import Chosen
 from carom.learning.estimation.estimate import Told, estimate
 from carom.learning.estimation.verdict import Estimate, Fit
-from carom.learning.evaluate import predict
 from carom.learning.model_file import save_model
 from carom.learning.models import mass_ratios
 from carom.learning.progress import LoopProgress
 from carom.learning.run import MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.simulation.files import save_recording
-from carom.simulation.observations import Observations, load_observations
+from carom.simulation.observations import load_observations
 from carom.simulation.recording import Recording
+from carom.simulation.rollout import Trajectory
 
 BY_ITSELF = ("friction", "restitution", "mass", "gravity")
 """What is learned of positions where nothing is said."""
+SHORTEST = 5
+"""Windows of fewer samples are not shown."""
 TRAINED = {"mass", "friction", "restitution", "potential"}
 """What the trainer can learn of positions and velocities."""
 
@@ -79,14 +83,13 @@ def learn_by_estimator(
         write_whole(run.path / SYSTEM, chosen.source)
     save_model(run.path / MODEL, told.system, impact=told.fit.impact_rule)
     run.write_json(TRUTH, None)
-    shown = shown_motions(told, held if held is not None else observations)
+    shown, predicted = shown_motions(told)
     save_recording(run.path / TEST_DATA, shown)
     run.write_json(REPORT, report_of(told))
     verdict_first(console, told.fit)
     console.print(estimates_table(told.estimates))
     for names in told.fit.alike:
         console.print(f"These data do not tell apart: {', '.join(names)}.", highlight=False)
-    predicted = predict(told.system, shown, impact=told.fit.impact_rule)
     pictures(run, told.system, shown, predicted)
     console.print(f"Done ({told.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
 
@@ -150,28 +153,41 @@ def _digits(half: float) -> int:
     return int(np.clip(1 - np.floor(np.log10(half)), 2, 12)) if 0 < half < np.inf else 4
 
 
-def shown_motions(told: Told, observations: Observations) -> Recording:
-    """Trajectories that were held out, from the starts that were fitted, at equal steps: to look at and to predict.
+def shown_motions(told: Told) -> tuple[Recording, Trajectory]:
+    """Windows that were held out, at equal steps, and their motion by the learned system from the starts that fit.
 
     Positions are those seen, between samples on straight lines; velocities, but for the first, their differences.
     """
-    step, parts = told.step, []
-    for track in told.held:
-        last = int(np.floor((track.time[-1] - track.time[0]) / step + 1e-6))
-        if last < 4:
+    parts = []
+    for window in told.held:
+        time = told.step * np.arange(int(np.floor(window.time[-1] / told.step + 1e-6)) + 1)
+        if len(time) < SHORTEST:
             continue
-        time = step * np.arange(last + 1)
-        x = np.stack(
-            [
-                np.interp(time, (track.time - track.time[0])[seen], column[seen])
-                for column in track.x.reshape(len(track.x), -1).T
-                for seen in [np.isfinite(column)]
-            ],
-            axis=1,
-        ).reshape(last + 1, *track.x.shape[1:])
-        v = np.gradient(x, step, axis=0, edge_order=2)
-        x[0], v[0] = track.start
-        parts.append((x, v))
-    most = max(len(x) for x, _ in parts)
-    xs, vs = (np.stack([np.pad(p[k], ((0, most - len(p[k])), (0, 0), (0, 0)), "edge") for p in parts]) for k in (0, 1))
-    return Recording.of(xs, vs, dt=step, length=np.array([len(x) for x, _ in parts]))
+        x, explained = (_at_times(time, window.time, part) for part in (window.x, window.explained))
+        v, moves = (np.gradient(part, told.step, axis=0, edge_order=2) for part in (x, explained))
+        x[0], v[0] = window.start
+        parts.append((x, v, explained, moves))
+    most = max(len(part[0]) for part in parts)
+    x, v, explained, moves = (
+        np.stack([np.pad(part[k], ((0, most - len(part[k])), (0, 0), (0, 0)), "edge") for part in parts])
+        for k in range(4)
+    )
+    seen = Recording.of(x, v, dt=told.step, length=np.array([len(part[0]) for part in parts]))
+    nothing = np.zeros(x.shape[:2])
+    predicted = Trajectory(
+        x=jnp.asarray(explained),
+        v=jnp.asarray(moves),
+        contact=jnp.asarray(nothing > 0),
+        time=jnp.asarray(seen.time),
+        overflow=jnp.asarray(nothing.astype(int)),
+        residual=jnp.asarray(nothing),
+    )
+    return seen, predicted
+
+
+def _at_times(
+    time: Float[np.ndarray, " S"], there: Float[np.ndarray, " T"], x: Float[np.ndarray, "T n d"]
+) -> Float[np.ndarray, "S n d"]:
+    columns = x.reshape(len(x), -1).T
+    shown = [np.interp(time, there[good], column[good]) for column in columns for good in [np.isfinite(column)]]
+    return np.stack(shown, axis=1).reshape(len(time), *x.shape[1:])

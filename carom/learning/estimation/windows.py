@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from carom.simulation.clock import digit_of
+from carom.simulation.clock import STEP_TOLERANCE, digit_of
 from carom.simulation.observations import Observations
 
 REACH = 8
@@ -112,7 +112,7 @@ def survey(observations: Observations) -> Survey:
     step = float(np.median(np.concatenate([np.diff(time) for time, _ in tracks])))
     reach = max(float(np.nanmax(x) - np.nanmin(x)) for _, x in tracks)
     floor = FLOOR * reach
-    digit = digit_of(observations.time, np.isfinite(observations.time))
+    digit = _digit(observations, step)
     timing = [_timing(time, x, digit) for time, x in tracks]
     noise = np.maximum(_noise([(t, x, np.zeros(0, int)) for t, x in tracks], robust=True), floor)
     misses = [_misses(time, x) for time, x in tracks]
@@ -131,6 +131,15 @@ def survey(observations: Observations) -> Survey:
         np.array(places).reshape(-1, 2),
         step,
     )
+
+
+def _digit(observations: Observations, step: float) -> float:
+    """What the last digit of times is worth (s); none where all are at whole steps, which rounding has not moved."""
+    steps = np.diff(observations.time, axis=1) / step
+    steps = steps[np.isfinite(steps)]
+    if np.all(np.abs(steps - np.round(steps)) <= STEP_TOLERANCE * np.maximum(steps, 1)):
+        return 0.0
+    return digit_of(observations.time, np.isfinite(observations.time))
 
 
 def _timing(time: np.ndarray, x: np.ndarray, digit: float) -> Float[np.ndarray, "T n d"]:
