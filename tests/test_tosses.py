@@ -358,7 +358,7 @@ def test_from_a_pose_file_to_a_table(tosses, tmp_path, monkeypatch, capsys):
     assert set(report["learned"]["estimates"]) == {"friction"}
     main(["evaluate", "run", "--protocol", "B", "--data", "lab-trajectories.h5", "--against", "run"])
     assert "bootstrap over 2 sessions" in capsys.readouterr().out
-    rows = list(csv.DictReader((tmp_path / "run" / "toss_errors_B.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "run" / "toss_errors_B.csv").read_text().splitlines()))
     assert len(rows) == 30
     assert {row["session"] for row in rows} == {"0", "1"}
     for name in ("tosses.png", "toss_errors.png", "prediction.gif", "model.carom", "toss_errors_A.csv"):
