@@ -34,8 +34,8 @@ _SINGULAR = 1e-9
 """Singular values below this share of the largest one are zero."""
 _STILL = 1e-7
 """Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
-_STEPS = 30
-_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
+_STEPS = 80
+_LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)
 _FOUND = 1e-13
 
 
@@ -141,8 +141,9 @@ def least_norm(
         whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(D)
         whole = jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
         curvature = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
-        # Flat directions: where all impulses along them are at an edge.
-        curvature = curvature + jnp.where(counts, 1e-10, 1)[:, None] * eye
+        # Flat directions: where all impulses along them are at an edge. The less, the nearer the end.
+        ridge = jnp.clip(0.01 * missed(slope), 1e-10, 0.01)[:, None]
+        curvature = curvature + jnp.where(counts, ridge, 1)[..., None] * eye
         change = -jnp.linalg.solve(curvature, slope[..., None])[..., 0]
         tried = jnp.stack([a + length * change for length in _LENGTHS])
         values = jax.vmap(lambda t: look(t)[0])(tried)
