@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cone_problems import apply, clarabel_solution, contact_scale, generate
+from contact_states import state_of
 from systems import ball_on_floor, refused
 
 import carom
-from carom.contact.candidates import Active
 from carom.contact.impulses import CONTACT_MODELS
 from carom.learning.dataset import Chunks, contact_flags
 from carom.learning.loss import train_step
@@ -26,32 +26,6 @@ from carom.simulation.rollout import simulate
 TINY = carom.LearnConfig(
     epochs=2, chunks_per_epoch=16, batch_size=16, chunk_length=3, width=8, depth=1, checkpoint_every=1, refine=False
 )
-
-
-def state_of(problem) -> carom.ContactState:
-    """A batch of states whose points move by the impulses themselves: the velocity jump of a model is its impulse."""
-    batch, k, d = problem.v.shape
-    present = contact_scale(problem.A, d) > 0
-    ones = np.ones((batch, k))
-    return carom.ContactState(
-        x=jnp.zeros_like(problem.v),
-        v=jnp.asarray(problem.v),
-        active=Active(
-            active=jnp.asarray(present),
-            gap=jnp.asarray(-ones),
-            jacobian=jnp.zeros((batch, k, d, k, d)),
-            property_index=jnp.zeros((batch, k), int),
-            candidate=jnp.broadcast_to(jnp.arange(k), (batch, k)),
-            closed=jnp.asarray(present),
-            overflow=jnp.zeros(batch, int),
-        ),
-        response=jnp.broadcast_to(jnp.eye(k * d).reshape(k * d, k, d), (batch, k * d, k, d)),
-        delassus=jnp.asarray(problem.A),
-        velocity=jnp.asarray(problem.v),
-        target=jnp.asarray(problem.v_star),
-        friction=jnp.asarray(problem.friction),
-        restitution=jnp.asarray(problem.restitution),
-    )
 
 
 @eqx.filter_jit

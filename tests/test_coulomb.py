@@ -4,56 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cone_problems import FAMILIES, contact_scale, frames, generate
+from cone_problems import FAMILIES, generate, law, rigid_bodies
 
 from carom.contact.coulomb import solve_coulomb_problem
 
 ROOM = 6
 
 solve = jax.jit(solve_coulomb_problem)
-
-
-def rigid_bodies(rng, batch, contacts, d):
-    """Contacts among rigid bodies and walls, mass ratios up to 100, friction up to 2: many are redundant."""
-    count, dof = (contacts + 1) // 2, d * (d + 1) // 2
-    J = np.zeros((batch, contacts, d, count, dof))
-    first = rng.integers(count, size=(batch, contacts))
-    second = (first + 1 + rng.integers(max(count - 1, 1), size=(batch, contacts))) % count
-    alone = (rng.random((batch, contacts)) < 0.4) | (first == second)
-    frame, index = frames(rng, batch, contacts, d), np.indices((batch, contacts))
-    for body, sign in ((first, np.ones((batch, contacts))), (second, np.where(alone, 0, -1))):
-        arm = rng.normal(size=(batch, contacts, d))
-        if d == 2:
-            turn = np.stack([-arm[..., 1], arm[..., 0]], -1)[..., None]
-        else:
-            turn = -np.cross(np.eye(3), arm[..., None, :]).swapaxes(-1, -2)
-        moves = np.concatenate([np.broadcast_to(np.eye(d), (*arm.shape[:2], d, d)), turn], axis=-1)
-        J[index[0], index[1], :, body] += sign[..., None, None] * (frame @ moves)
-    J = J.reshape(batch, contacts * d, count * dof)
-    mass = 10 ** rng.uniform(-1, 1, (batch, count, 1))
-    inverse = np.concatenate(
-        [np.repeat(1 / mass, d, axis=2), 1 / (mass * rng.uniform(0.1, 0.6, (batch, count, dof - d)))], axis=2
-    ).reshape(batch, -1)
-    A = np.einsum("bri,bi,bsi->brs", J, inverse, J)
-    v = np.einsum("bri,bi->br", J, rng.normal(size=inverse.shape)).reshape(batch, contacts, d)
-    pad = ROOM - contacts
-    A = np.pad(A, ((0, 0), (0, pad * d), (0, pad * d)))
-    return A, np.pad(v, ((0, 0), (0, pad), (0, 0))), np.pad(rng.uniform(0, 2, (batch, contacts)), ((0, 0), (0, pad)))
-
-
-def law(A, v, mu, f):
-    """By how much impulses miss the law (gaps, approach, cones, friction against the sliding) in scaled units."""
-    normal = contact_scale(A, v.shape[2])
-    size = np.where(normal > 0, 1 / np.sqrt(np.where(normal > 0, normal, 1)), 0)[..., None]
-    u = (A @ f.reshape(len(f), -1, 1)).reshape(v.shape) + v
-    unit = np.maximum(np.abs(size * v).max((1, 2), keepdims=True), 1e-300)
-    u, f = u * size / unit, f / np.where(size > 0, size * unit, np.inf)
-    largest = np.maximum(np.abs(f).max((1, 2)), 1)[:, None]
-    slip, friction = np.linalg.norm(u[..., 1:], axis=-1), np.linalg.norm(f[..., 1:], axis=-1)
-    work = np.sum(f[..., 1:] * u[..., 1:], axis=-1) + mu * f[..., 0] * slip
-    parts = [np.maximum(-u[..., 0], 0), np.abs(np.minimum(f[..., 0], u[..., 0])), friction - mu * f[..., 0]]
-    parts.append(np.minimum(np.abs(work), slip))
-    return (np.max(parts, axis=0) / largest).max(1)
 
 
 @pytest.mark.slow
@@ -64,7 +21,7 @@ def test_the_law_holds(d):
     rng = np.random.default_rng(8)
     made = [generate(rng, family, 64, ROOM, d) for family in FAMILIES]
     drawn = [(p.A, p.v, p.friction) for p in made]
-    drawn += [rigid_bodies(rng, 64, contacts, d) for contacts in range(1, ROOM + 1)]
+    drawn += [rigid_bodies(rng, 64, ROOM, d, contacts) for contacts in range(1, ROOM + 1)]
     A, v, mu = (np.concatenate(part) for part in zip(*drawn, strict=True))
     out = solve(A, v, mu)
     reported, missed = np.asarray(out.residual), law(A, v, mu, np.asarray(out.impulse))
@@ -78,7 +35,7 @@ def test_the_law_holds(d):
 def test_derivatives_are_those_of_differences():
     """By matrix, velocity, friction and bound, away from changes of mode; forward and reverse are one."""
     rng = np.random.default_rng(4)
-    A, v, mu = rigid_bodies(rng, 48, 3, 3)
+    A, v, mu = rigid_bodies(rng, 48, ROOM, 3, 3)
     A = A + 0.05 * np.eye(A.shape[1]) * (np.diagonal(A, axis1=1, axis2=2) > 0)[:, None]  # regular: one impulse
     lower = rng.uniform(0, 0.3, mu.shape) * (rng.random(mu.shape) < 0.5)
     point = tuple(map(jnp.asarray, (A, v, mu, lower)))

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cone_problems import FAMILIES, contact_scale, generate
-from test_contact_models import state_of
-from test_coulomb import ROOM, rigid_bodies
+from cone_problems import FAMILIES, contact_scale, generate, rigid_bodies
+from contact_states import state_of
+from test_coulomb import ROOM
 
 import carom
 from carom.contact.energy import dissipative, islands
@@ -30,7 +30,9 @@ def gains(problem, model):
 def test_impacts_add_no_energy(model):
     rng = np.random.default_rng(2)
     made = [generate(rng, family, 64, ROOM, 3) for family in FAMILIES]
-    A, v, mu = (np.concatenate(part) for part in zip(*(rigid_bodies(rng, 64, k, 3) for k in (2, 4, 6)), strict=True))
+    A, v, mu = (
+        np.concatenate(part) for part in zip(*(rigid_bodies(rng, 64, ROOM, 3, k) for k in (2, 4, 6)), strict=True)
+    )
     e = rng.uniform(0, 1, mu.shape)
     made.append(made[0]._replace(A=A, v=v, friction=mu, restitution=e, v_star=0 * v, lower=0 * mu))
     everything = made[0]._replace(

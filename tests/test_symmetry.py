@@ -40,10 +40,10 @@ def _steps(name, model):
 
 
 def _cases():
-    budget = {("three_disks", "coulomb"), ("spheres", "coulomb")}
     for name in SCENES:
         for model in MODELS:
-            yield pytest.param(name, model, marks=[pytest.mark.ci_budget] if (name, model) in budget else [])
+            in_budget = (name, model) == ("three_disks", "coulomb")
+            yield pytest.param(name, model, marks=[pytest.mark.ci_budget] if in_budget else [])
 
 
 @pytest.mark.slow
