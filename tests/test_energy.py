@@ -1,27 +1,14 @@
 """No impact adds energy: random mechanisms, unlike restitutions, friction up to 2; a cradle of balls."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cone_problems import FAMILIES, contact_scale, generate, rigid_bodies
-from contact_states import state_of
+from cone_problems import FAMILIES, generate, rigid_bodies
+from contact_states import gains
 from test_coulomb import ROOM
 
 import carom
-from carom.contact.energy import dissipative, islands
-
-
-def gains(problem, model):
-    """Change of the energy by each impact, relative to that of the contacts' velocities."""
-    state = state_of(problem)._replace(target=jnp.zeros_like(jnp.asarray(problem.v)))
-    jump = jax.jit(jax.vmap(lambda one: dissipative(one, model(one))))(state)
-    impulse = np.asarray(jump.impulse).sum(1)
-    change = np.einsum("bxy,by->bx", problem.A, impulse.reshape(len(impulse), -1)).reshape(impulse.shape)
-    gained = np.sum(impulse * (problem.v + change / 2), axis=(1, 2))
-    normal = contact_scale(problem.A, problem.v.shape[2])[..., None]
-    energy = np.sum(np.where(normal > 0, problem.v**2 / np.where(normal > 0, normal, 1), 0), axis=(1, 2))
-    return gained / np.where(energy > 0, energy, np.inf), np.asarray(jump.residual)
+from carom.contact.energy import islands
 
 
 @pytest.mark.slow

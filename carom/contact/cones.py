@@ -27,6 +27,7 @@ from carom.contact.cone_algebra import (
     Scales,
     Scaling,
     add_normal,
+    matvec,
     residual_of,
     scale,
 )
@@ -237,13 +238,13 @@ def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, fou
     k, d, batch = problem.q.shape
     # From S of the program, with its friction, to a scale for normal and tangents alike.
     ways = jnp.concatenate([jnp.ones_like(scales.mu)[:, None], jnp.repeat(scales.mu[:, None], d - 1, axis=1)], axis=1)
-    over = jnp.where(ways > 0, 1 / jnp.where(ways > 0, ways, 1), 0).reshape(k * d, batch)
+    over = jnp.where(ways > 0, 1 / jnp.where(ways > 0, ways, 1), 0)
+    rows = over.reshape(k * d, batch)
     eye = jnp.eye(k * d, dtype=over.dtype)[..., None]
     plain = problem.Q - scales.regularization.reshape(k * d, 1, batch) * eye
-    velocity = (jnp.sum(plain * found.y.reshape(1, k * d, batch), axis=1) * over).reshape(k, d, batch)
-    Q, q = over[:, None] * plain * over, problem.q * over.reshape(k, d, batch)
-    lower = jnp.maximum(problem.lower, 0)
-    least = least_norm(Q, q, velocity + q, ways * found.y, scales.mu, lower, lifts=True) * over.reshape(k, d, batch)
+    Q, q = rows[:, None] * plain * rows, over * problem.q
+    u = over * matvec(plain, found.y) + q
+    least = over * least_norm(Q, q, u, ways * found.y, scales.mu, jnp.maximum(problem.lower, 0), lifts=True)
     residual = residual_of(problem, least, scales.regularization)
     takes = residual <= jnp.maximum(_wanted(settings), found.residual)
     return found._replace(y=jnp.where(takes, least, found.y), residual=jnp.where(takes, residual, found.residual))

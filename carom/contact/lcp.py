@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
+from carom.contact.cone_algebra import matvec
 from carom.contact.lemke import lemke
 from carom.contact.linalg import Cholesky
 from carom.errors import CaromError
@@ -83,13 +84,12 @@ def pyramid_directions(d: int, facets: int) -> np.ndarray:
 
 def _after(problem: _Problem, f: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
     """Velocity after the impact, less rebound and target."""
-    return jnp.sum(problem.A * f.reshape(1, -1, f.shape[-1]), axis=1).reshape(f.shape) + problem.v
+    return matvec(problem.A, f) + problem.v
 
 
 def _energy(problem: _Problem, f: Float[Array, "K d B"]) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """What the impulses add to the energy, and how much they exchange."""
-    change = jnp.sum(problem.A * f.reshape(1, -1, f.shape[-1]), axis=1).reshape(f.shape)
-    added = jnp.sum(f * (problem.before + change / 2), axis=(0, 1))
+    added = jnp.sum(f * (problem.before + matvec(problem.A, f) / 2), axis=(0, 1))
     return added, jnp.sum(jnp.abs(f * problem.before), axis=(0, 1))
 
 
