@@ -10,6 +10,9 @@ from jaxtyping import Array, Bool, Int
 SMALL = 2
 """Contacts up to which a problem of a larger batch is solved in a small form of its own."""
 
+FEW, FEW_CONTACTS = 4, 8
+"""Batches of so few problems, with room for so few contacts, are solved in one form."""
+
 
 def contacts_used(A: Array, contacts: int) -> Int[Array, " B"]:
     """How many contacts of each problem `A` (B, K d, K d) to look at: behind them all is padding.
@@ -21,8 +24,12 @@ def contacts_used(A: Array, contacts: int) -> Int[Array, " B"]:
 
 
 def by_size(used: Int[Array, " B"], contacts: int) -> list[tuple[int, Bool[Array, " B"]]]:
-    """The forms in which problems with room for `contacts` are compiled: a number of contacts, and whose form it is."""
-    sizes = (SMALL, contacts) if contacts > 2 * SMALL else (contacts,)
+    """The forms in which problems with room for `contacts` are compiled: a number of contacts, and whose form it is.
+
+    A few problems gain less by a form of their own than compiling it costs.
+    """
+    several = contacts > 2 * SMALL and (used.shape[0] > FEW or contacts > FEW_CONTACTS)
+    sizes = (SMALL, contacts) if several else (contacts,)
     return [(size, (used > smaller) & (used <= size)) for smaller, size in zip((0, *sizes[:-1]), sizes, strict=True)]
 
 
@@ -36,7 +43,8 @@ def solve_chosen(
     results are put in at the front of each axis.
     """
     batch = chosen.shape[0]
-    block = min(block, batch)
+    if batch <= block:
+        return jax.lax.cond(jnp.any(chosen), lambda: _solve_all(solve_block, arrays, chosen, out), lambda: out)
     order = jnp.nonzero(chosen, size=-(-batch // block) * block, fill_value=batch)[0]
 
     def body(i, out):
@@ -50,6 +58,19 @@ def solve_chosen(
 
     blocks = (jnp.sum(chosen) + block - 1) // block
     return jax.lax.fori_loop(0, blocks, body, out)
+
+
+def _solve_all(solve_block: Callable[..., Any], arrays: tuple[Array, ...], chosen: Bool[Array, " B"], out: Any) -> Any:
+    """`solve_chosen` in one block."""
+
+    def mine(x: Array) -> Array:
+        return chosen.reshape(-1, *(1,) * (x.ndim - 1))
+
+    def put(whole: Array, part: Array) -> Array:
+        front = tuple(slice(0, size) for size in part.shape)
+        return whole.at[front].set(jnp.where(mine(part), part, whole[front]))
+
+    return jax.tree.map(put, out, solve_block(*(jnp.where(mine(x), x, jnp.zeros_like(x)) for x in arrays)))
 
 
 def as_one_batch(solve: Callable[..., Any], name: str) -> Callable[..., Any]:

@@ -3,12 +3,12 @@
 Batch last: see `carom.contact.cones` for the problem, its scaling and the notation.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.linalg import Cholesky, triangle_of
 
@@ -135,6 +135,16 @@ class Scaling(NamedTuple):
 
 def matvec(Q, y):
     return jnp.sum(Q * y.reshape(1, -1, y.shape[-1]), axis=1).reshape(y.shape)
+
+
+def pick(stacked: Any, chosen: Int[Array, " B"]) -> Any:
+    """Of a tree of arrays (m, ..., B) for each of the batch the one that is `chosen`, as (..., B)."""
+
+    def of(x: Array) -> Array:
+        mine = (jnp.arange(x.shape[0])[:, None] == chosen).reshape(x.shape[0], *(1,) * (x.ndim - 2), -1)
+        return jnp.any(mine & x, axis=0) if x.dtype == bool else jnp.sum(jnp.where(mine, x, 0), axis=0)
+
+    return jax.tree.map(of, stacked)
 
 
 def add_normal(x, normal):

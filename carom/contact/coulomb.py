@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
-from carom.contact.cone_algebra import dot, matvec
+from carom.contact.cone_algebra import dot, matvec, pick
 from carom.contact.cones import apply, solve_cones
 from carom.contact.least_norm import least_norm
 
@@ -88,6 +88,12 @@ class _Modes(NamedTuple):
     share: Float[Array, "K B"]  # radius / |y_t - rho u_t| of those that slide
     radius: Float[Array, "K B"]  # of the disc, per unit of mu
 
+    @classmethod
+    def nothing(cls, problem: _Problem) -> "_Modes":
+        """Where nothing is known yet."""
+        zeros, no = jnp.zeros_like(problem.q), jnp.zeros(problem.mu.shape, bool)
+        return cls(zeros, no, no, zeros[:, 1:], zeros[:, 0], zeros[:, 0])
+
 
 def _modes(problem: _Problem, y: Float[Array, "K d B"], u: Float[Array, "K d B"], apex: Array | bool = False) -> _Modes:
     """Modes at `y` with the velocities `u`; contacts in `apex` are held by their bound where `y` is next to zero."""
@@ -142,17 +148,20 @@ def _jacobian(problem: _Problem, modes: _Modes) -> Float[Array, "B n n"]:
     return jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
 
 
-def _linear_solve(matrix: Float[Array, "B n n"], rhs: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
-    flat = jnp.moveaxis(rhs.reshape(-1, rhs.shape[-1]), -1, 0)[..., None]
-    return jnp.moveaxis(jnp.linalg.solve(matrix, flat)[..., 0], 0, -1).reshape(rhs.shape)
-
-
 def _softened(problem: _Problem, delta=_DELTA) -> _Problem:
     n = problem.Q.shape[0]
     return problem._replace(Q=problem.Q + delta * jnp.eye(n, dtype=problem.Q.dtype)[..., None])
 
 
-def _residual(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, " B"]:
+class _Judged(NamedTuple):
+    """An impulse and how it meets the law."""
+
+    y: Float[Array, "K d B"]
+    modes: _Modes
+    residual: Float[Array, " B"]
+
+
+def _judge(problem: _Problem, y: Float[Array, "K d B"]) -> _Judged:
     """Largest |H|: impulses relative to the largest, velocities to the largest term of `Q y + q`.
 
     Unlike `H` of the modes no mode can hide it: an impulse outside of its cone counts.
@@ -161,21 +170,14 @@ def _residual(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, " B"]
     modes = _modes(problem, y, u)
     impulse = jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
     velocity = jnp.maximum(jnp.max(matvec(jnp.abs(problem.Q), jnp.abs(y)), axis=(0, 1)), 1)
-    scale = jnp.where(modes.closes, velocity, impulse)
-    tangent = jnp.where(modes.sticks, velocity, impulse)
-    parts = jnp.concatenate([jnp.abs(modes.H[:, :1]) / scale[:, None], jnp.abs(modes.H[:, 1:]) / tangent[:, None]], 1)
+    by_velocity = jnp.concatenate([modes.closes[:, None], jnp.broadcast_to(modes.sticks[:, None], y[:, 1:].shape)], 1)
+    parts = jnp.abs(modes.H) / jnp.where(by_velocity, velocity, impulse)
     # What keeps to its bound or its cone by H alone may still be pushed through it.
     approach = jnp.where(problem.present, jnp.maximum(-u[:, 0], 0), 0) / velocity
     outside = jnp.sqrt(dot(y[:, 1:], y[:, 1:])) - problem.mu * jnp.maximum(y[:, 0], 0)
     beyond = jnp.maximum(jnp.maximum(outside, problem.lower - y[:, 0]), 0) / impulse
     worst = jnp.max(jnp.concatenate([parts, approach[:, None], beyond[:, None]], axis=1), axis=(0, 1))
-    return jnp.where(jnp.isfinite(worst), worst, jnp.inf)
-
-
-def _least_norm(problem: _Problem, y: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
-    """Of all impulses with the modes at `y` that of least norm, where it obeys the law."""
-    least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
-    return jnp.where(_residual(problem, least) <= _SOLVED, least, y)
+    return _Judged(y, modes, jnp.where(jnp.isfinite(worst), worst, jnp.inf))
 
 
 # --- Sweeps and steps -------------------------------------------------------------------------------------------
@@ -207,47 +209,70 @@ def _sweep(problem: _Problem, y: Float[Array, "K d B"], sweeps) -> Float[Array, 
 def _newton(problem: _Problem, y: Float[Array, "K d B"], steps: int) -> Float[Array, "K d B"]:
     """Newton steps from `y`, each as long as makes `|H|` least of some lengths; the best impulse on the way."""
 
-    def merit(y):
-        u = matvec(problem.Q, y) + problem.q
-        H = _modes(problem, y, u).H
-        return jnp.max(jnp.abs(H), axis=(0, 1))
-
     class _Path(NamedTuple):
         y: Array
+        modes: _Modes
         best: Array
         least: Array
         step: Array
 
+    def look(y: Array) -> tuple[Array, Array, _Modes]:
+        modes = _modes(problem, y, matvec(problem.Q, y) + problem.q)
+        return jnp.max(jnp.abs(modes.H), axis=(0, 1)), y, modes
+
     def keep_going(path: _Path):
-        return (path.step < steps) & jnp.any(path.least > _CONVERGED)
+        return (path.step <= steps) & jnp.any(path.least > _CONVERGED)
 
     def body(path: _Path) -> _Path:
-        y = path.y
-        u = matvec(problem.Q, y) + problem.q
-        modes = _modes(problem, y, u)
-        change = _linear_solve(_jacobian(problem, modes), -modes.H)
-        change = jnp.where(jnp.isfinite(change), change, 0)
-        tried = jnp.stack([y + s * change for s in _LENGTHS])
-        merits = jax.vmap(merit)(tried)
-        chosen = jnp.argmin(jnp.where(jnp.isnan(merits), jnp.inf, merits), axis=0)
-        index = jnp.arange(y.shape[-1])
-        y, value = jnp.moveaxis(tried[chosen, :, :, index], 0, -1), merits[chosen, index]
+        # The first time there is no step, only a look at the start.
+        change = _step(problem, path.modes, path.step > 0)
+        merits, *looks = jax.vmap(lambda length: look(path.y + length * change))(jnp.array(_LENGTHS, path.y.dtype))
+        merits = jnp.where(jnp.isnan(merits), jnp.inf, merits)
+        value, (y, modes) = jnp.min(merits, axis=0), pick(looks, jnp.argmin(merits, axis=0))
         better = value < path.least
-        return _Path(y, jnp.where(better, y, path.best), jnp.where(better, value, path.least), path.step + 1)
+        return _Path(y, modes, jnp.where(better, y, path.best), jnp.where(better, value, path.least), path.step + 1)
 
-    start = _Path(y, y, merit(y), jnp.asarray(0))
+    start = _Path(y, _Modes.nothing(problem), y, jnp.full_like(y[0, 0], jnp.inf), jnp.asarray(0))
     return jax.lax.while_loop(keep_going, body, start).best
 
 
-def _polish(problem: _Problem, soft: _Problem, y: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
-    """`y` less what the diagonal has changed of the velocities, if that meets the law better."""
+def _step(problem: _Problem, modes: _Modes, wanted: Bool[Array, ""]) -> Float[Array, "K d B"]:
+    """The Newton step from where `modes` are, if it is `wanted`, or none."""
 
-    def improve(_, y):
-        modes = _modes(problem, y, matvec(problem.Q, y) + problem.q)
-        moved = y + _linear_solve(_jacobian(soft, modes), -modes.H)
-        return jnp.where(_residual(problem, moved) < _residual(problem, y), moved, y)
+    def solve() -> Array:
+        flat = jnp.moveaxis(-modes.H.reshape(-1, modes.H.shape[-1]), -1, 0)[..., None]
+        change = jnp.linalg.solve(_jacobian(problem, modes), flat)[..., 0]
+        change = jnp.moveaxis(change, 0, -1).reshape(modes.H.shape)
+        return jnp.where(jnp.isfinite(change), change, 0)
 
-    return jax.lax.fori_loop(0, 2, improve, y)
+    return jax.lax.cond(wanted, solve, lambda: jnp.zeros_like(modes.H))
+
+
+_POLISHING = 2
+
+
+def _polish(problem: _Problem, soft: _Problem, y: Float[Array, "K d B"], steps: Bool[Array, ""]) -> _Judged:
+    """`y` less what the diagonal has changed of the velocities, if that meets the law better, and if `steps`.
+
+    Then, of all impulses with the modes there, that of least norm, where it obeys the law.
+    """
+
+    def improve(count, best: _Judged) -> _Judged:
+        last = count == _POLISHING + 1
+
+        def least() -> Array:
+            u = matvec(problem.Q, best.y) + problem.q
+            return least_norm(problem.Q, problem.q, u, best.y, problem.mu, problem.lower)
+
+        def moved() -> Array:
+            return best.y + _step(soft, best.modes, steps & (count > 0))
+
+        new = _judge(problem, jax.lax.cond(last, least, moved))
+        better = jnp.where(last, new.residual <= _SOLVED, new.residual < best.residual)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
+
+    unknown = _Judged(y, _Modes.nothing(problem), jnp.full_like(y[0, 0], jnp.inf))
+    return jax.lax.fori_loop(0, _POLISHING + 2, improve, unknown)
 
 
 def _scale(A: Array, v: Array, friction: Array, lower: Array, reference: Array):
@@ -324,32 +349,33 @@ class _Search(NamedTuple):
 
 def _search(problem: _Problem, start: Float[Array, "K d B"], rounds: Int[Array, ""]) -> _Search:
     """Rounds of sweeps and Newton steps from `start`, until every problem is solved."""
-    soft, start = _softened(problem), _least_norm(problem, start)
+    soft = _softened(problem)
 
     def keep_going(search: _Search):
         return (search.round < rounds) & jnp.any(search.residual > _SOLVED)
 
+    def smaller(state):
+        y, delta = state
+        return _newton(_softened(problem, delta), y, _STEPS), delta / 10
+
     def body(search: _Search) -> _Search:
-        again = search.round > 0
+        # Round -1 looks at the start.
+        begun, again = search.round >= 0, search.round > 0
         swept = _sweep(soft, search.swept, jnp.where(again, _SWEEPS * 2**search.round, 0))
-
-        def smaller(state):
-            y, delta = state
-            return _newton(_softened(problem, delta), y, _STEPS), delta / 10
-
         # Every other round comes down from a large diagonal, with which there is one solution.
-        first = jnp.where(again & (search.round % 2 == 0), 0.1, _DELTA).astype(swept.dtype)
+        first = jnp.where(begun, jnp.where(again & (search.round % 2 == 0), 0.1, _DELTA), 0).astype(swept.dtype)
         y, _ = jax.lax.while_loop(lambda state: state[1] > 0.5 * _DELTA, smaller, (swept, first))
-        y = _least_norm(problem, _polish(problem, soft, y))
-        residual = _residual(problem, y)
-        better = (residual < search.residual) & (search.residual > _SOLVED)
-        y = jnp.where(better, y, search.y)
-        return _Search(swept, y, jnp.where(better, residual, search.residual), search.round + 1)
+        new = _polish(problem, soft, y, begun)
+        better = ((new.residual < search.residual) & (search.residual > _SOLVED)) | ~begun
+        y = jnp.where(better, new.y, search.y)
+        # What is just between two modes (a contact that sticks with all the friction it has, one that only touches) is
+        # seen as held, whatever rounding says.
+        held = y.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
+        swept = jnp.where(begun, swept, held)
+        return _Search(swept, y, jnp.where(better, new.residual, search.residual), search.round + 1)
 
-    # What is just between two modes (a contact that sticks with all the friction it has, one that only touches) is seen
-    # as held, whatever rounding says.
-    held = start.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
-    return jax.lax.while_loop(keep_going, body, _Search(held, start, _residual(problem, start), jnp.asarray(0)))
+    unknown = jnp.full_like(start[0, 0], jnp.inf)
+    return jax.lax.while_loop(keep_going, body, _Search(start, start, unknown, jnp.asarray(-1)))
 
 
 def _solve_block(A, v, friction, lower, reference, start, rounds, *, sensitivity: bool):

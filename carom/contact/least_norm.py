@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from carom.contact.cone_algebra import dot
+from carom.contact.cone_algebra import dot, pick
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -108,53 +108,57 @@ def least_norm(
     def first(x: Array) -> Array:
         return jnp.moveaxis(x.reshape(k * d, batch), -1, 0)
 
-    def last(x: Array) -> Array:
-        return jnp.moveaxis(x, 0, -1).reshape(k, d, batch)
-
     held = jnp.broadcast_to((closed & (mu > 0) & (lifts | ~slides))[:, None], y[:, 1:].shape)
     rows = first(jnp.concatenate([closed[:, None], held], axis=1))
     wanted = first(jnp.where(slides[:, None] & lifts, u, 0) - q)
     left, values, right = jnp.linalg.svd(jnp.where(rows[..., None], jnp.moveaxis(Q, -1, 0), 0))
     counts = values > _SINGULAR * values[:, :1]
     V = jnp.where(counts[:, None], jnp.swapaxes(right, 1, 2), 0)
-    b = jnp.einsum("bij,bi->bj", left, jnp.where(rows, wanted, 0)) / jnp.where(counts, values, jnp.inf)
+    b = (jnp.einsum("bij,bi->bj", left, jnp.where(rows, wanted, 0)) / jnp.where(counts, values, jnp.inf)).T
     singular = jnp.sum(counts, axis=1) < jnp.sum(rows, axis=1)
-    size = jnp.maximum(jnp.max(jnp.abs(b), axis=1), 1)
+    size = jnp.maximum(jnp.max(jnp.abs(b), axis=0), 1)
 
-    def look(a):
-        z = last(jnp.einsum("bij,bj->bi", V, a))
-        P, D = _project(allowed, z)
-        value = jnp.sum(z**2 - (z - P) ** 2, axis=(0, 1)) / 2 - jnp.sum(b * a, axis=1)
-        return value, jnp.einsum("bij,bi->bj", V, first(P)) - b, D
-
-    def missed(slope):
-        return jnp.where(singular, jnp.max(jnp.abs(slope), axis=1) / size, 0)
-
-    def keep_going(state):
-        _, slope, _, step = state
-        return (step < _STEPS) & jnp.any(missed(slope) > _FOUND)
-
+    lengths = jnp.array(_LENGTHS, y.dtype)
     eye = jnp.eye(k * d, dtype=y.dtype)
 
-    def body(state):
-        a, slope, D, step = state
-        whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(D)
+    class Path(NamedTuple):
+        a: Float[Array, "n B"]
+        P: Float[Array, "K d B"]  # of `a`, as is what follows
+        D: Float[Array, "K d d B"]
+        slope: Float[Array, "n B"]
+        missed: Float[Array, " B"]
+        step: Int[Array, ""]
+
+    def look(a: Array) -> tuple[Array, Path]:
+        z = jnp.einsum("bij,jb->ib", V, a).reshape(k, d, batch)
+        P, D = _project(allowed, z)
+        value = jnp.sum(z**2 - (z - P) ** 2, axis=(0, 1)) / 2 - jnp.sum(b * a, axis=0)
+        slope = jnp.einsum("bij,ib->jb", V, P.reshape(k * d, batch)) - b
+        missed = jnp.where(singular, jnp.max(jnp.abs(slope), axis=0) / size, 0)
+        return value, Path(a, P, D, slope, missed, jnp.zeros((batch,), int))
+
+    def newton(path: Path) -> Array:
+        whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(path.D)
         whole = jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
         curvature = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
         # Flat directions: where all impulses along them are at an edge. The less, the nearer the end.
-        ridge = jnp.clip(0.01 * missed(slope), 1e-10, 0.01)[:, None]
+        ridge = jnp.clip(0.01 * path.missed, 1e-10, 0.01)[:, None]
         curvature = curvature + jnp.where(counts, ridge, 1)[..., None] * eye
-        change = -jnp.linalg.solve(curvature, slope[..., None])[..., 0]
-        tried = jnp.stack([a + length * change for length in _LENGTHS])
-        values = jax.vmap(lambda t: look(t)[0])(tried)
+        return -jnp.linalg.solve(curvature, path.slope.T[..., None])[..., 0].T
+
+    def keep_going(path: Path):
+        return (path.step <= _STEPS) & jnp.any(path.missed > _FOUND)
+
+    def body(path: Path) -> Path:
+        # The first time there is no step, only a look at the start.
+        change = jax.lax.cond(path.step > 0, newton, lambda path: jnp.zeros_like(path.a), path)
+        values, looks = jax.vmap(lambda length: look(path.a + length * change))(lengths)
         chosen = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0)
         # Near the end values differ by rounding alone.
-        chosen = jnp.where(missed(slope) < 1e-6, 0, chosen)
-        a = tried[chosen, jnp.arange(batch)]
-        _, slope, D = look(a)
-        return a, slope, D, step + 1
+        chosen = jnp.where(path.missed < 1e-6, 0, chosen)
+        return pick(looks, chosen)._replace(step=path.step + 1)
 
-    _, slope, D = look(b)
-    a, slope, _, _ = jax.lax.while_loop(keep_going, body, (b, slope, D, jnp.asarray(0)))
-    found = _project(allowed, last(jnp.einsum("bij,bj->bi", V, a)))[0]
-    return jnp.where(singular & (missed(slope) < 1e-9), found, y)
+    unknown = jnp.where(singular, jnp.inf, 0).astype(y.dtype)
+    start = Path(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown, jnp.asarray(0))
+    end = jax.lax.while_loop(keep_going, body, start)
+    return jnp.where(singular & (end.missed < 1e-9), end.P, y)
