@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from carom.contact.batching import FEW
 from carom.contact.cone_algebra import (
     TINY,
     Factored,
@@ -134,7 +135,7 @@ _SWEEPS = 30
 # Of the step that a bound of the contact's largest eigenvalue allows: the bound is a loose one.
 _OVERRELAXATION = 1.6
 _NEWTON_STEPS = 4
-# Most contacts whose updates are written out; more are a loop, which compiles at once.
+# Most contacts whose updates are written out for many problems; else they are a loop, which compiles at once.
 _UNROLLED = 8
 
 
@@ -165,7 +166,7 @@ def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
         return y.at[i].set(jnp.where(jnp.arange(d)[:, None] == 0, normal, shrunk))
 
     def body(_, y: Array) -> Array:
-        return jax.lax.fori_loop(0, k, contact, y, unroll=k <= _UNROLLED)
+        return jax.lax.fori_loop(0, k, contact, y, unroll=k <= _UNROLLED and batch > FEW)
 
     return jax.lax.fori_loop(0, _SWEEPS, body, jnp.zeros_like(problem.q)).astype(dtype)
 
@@ -187,7 +188,7 @@ def newton_steps(
     def step(y: Array, apex: Array) -> NewtonStep:
         active = ActiveSet.at(problem, y, apex)
         sides = jnp.stack([active.rhs, regularization * y], axis=2)
-        matrix = NewtonMatrix(problem.Q, active.scaling, active.curvature, sides)
+        matrix = NewtonMatrix(problem.Q, active.scaling, active.curvature, sides, unrolled=y.shape[-1] > FEW)
         regular = y + matrix.solution[:, :, 0]
         return NewtonStep(regular, regular + matrix.solution[:, :, 1], active.margin, matrix.factored())
 

@@ -11,7 +11,7 @@ SMALL = 2
 """Contacts up to which a problem of a larger batch is solved in a small form of its own."""
 
 FEW, FEW_CONTACTS = 4, 8
-"""Batches of so few problems, with room for so few contacts, are solved in one form."""
+"""Batches of so few problems are not worth code of their own; with room for so few contacts they have one form."""
 
 
 def contacts_used(A: Array, contacts: int) -> Int[Array, " B"]:

@@ -21,7 +21,8 @@ class ConeSettings(NamedTuple):
     `tolerance` is the largest residual of the optimality conditions (stationarity, complementarity) at which a problem
     counts as solved. `target` is the residual at which its iterations stop. `diagonal` is delta: what each contact's
     own block gets, relative to its A_nn. `smoothing` stops at that value of the complementarity products instead of at
-    `target`, which smooths the derivative across the transitions between sticking, sliding and separating.
+    `target`, which smooths the derivative across the transitions between sticking, sliding and separating. `least_norm`
+    says whether the impulse of least norm is wanted to rounding.
     """
 
     tolerance: float
@@ -29,6 +30,7 @@ class ConeSettings(NamedTuple):
     diagonal: float
     smoothing: float = 0.0
     max_iterations: int = 40
+    least_norm: bool = True
 
     @classmethod
     def for_dtype(cls, dtype, smoothing: float = 0.0, *, work=None) -> "ConeSettings":

@@ -116,7 +116,7 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
         out, matrix = _short_way(problem, scales, settings)
     else:
         out = _proximal_point(problem, scales, settings)
-        if settings.smoothing == 0 and v.dtype == jnp.float64:
+        if settings.least_norm and settings.smoothing == 0 and v.dtype == jnp.float64:
             out = _of_least_norm(problem, scales, settings, out)
         matrix = _last_matrix(problem, scales, settings, out) if sensitivity else None
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
@@ -303,8 +303,13 @@ def _batched(settings: ConeSettings, sensitivity: bool):
 
 
 def solve_cones(A, v, friction, lower, reference) -> Float[Array, "B K d"]:
-    """Impulses of `solve_cone_problem` for what has its own derivative, in the precision of the data."""
-    return _batched(ConeSettings.for_dtype(v.dtype), False)(A, v, friction, lower, reference)[0].impulse
+    """Impulses of `solve_cone_problem` for what has its own derivative, in the precision of the data.
+
+    Where many impulses give the same velocities it is one near that of least norm: who asks selects for himself.
+    """
+    return _batched(ConeSettings.for_dtype(v.dtype)._replace(least_norm=False), False)(
+        A, v, friction, lower, reference
+    )[0].impulse
 
 
 def _friction_scale(x, friction):

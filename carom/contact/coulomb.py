@@ -201,7 +201,7 @@ def _sweep(problem: _Problem, y: Float[Array, "K d B"], sweeps) -> Float[Array, 
         return y.at[i].set(jnp.concatenate([normal[None], moved]))
 
     def body(_, y: Array) -> Array:
-        return jax.lax.fori_loop(0, k, contact, y, unroll=k <= 4)
+        return jax.lax.fori_loop(0, k, contact, y)
 
     return jax.lax.fori_loop(0, sweeps, body, y)
 
