@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from carom.contact.cone_algebra import dot, pick
 
@@ -47,6 +47,16 @@ class _Set(NamedTuple):
     closed: Bool[Array, "K B"]
     slides: Bool[Array, "K B"]
     way: Float[Array, "K t B"]  # unit vector against the sliding
+
+
+class _Look(NamedTuple):
+    """What is known at `a`."""
+
+    a: Float[Array, "n B"]
+    P: Float[Array, "K d B"]  # of V a, and its derivative
+    D: Float[Array, "K d d B"]
+    slope: Float[Array, "n B"]  # phi'
+    missed: Float[Array, " B"]  # by it, where that matters
 
 
 def _project(allowed: _Set, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K d B"], Float[Array, "K d d B"]]:
@@ -121,44 +131,38 @@ def least_norm(
     lengths = jnp.array(_LENGTHS, y.dtype)
     eye = jnp.eye(k * d, dtype=y.dtype)
 
-    class Path(NamedTuple):
-        a: Float[Array, "n B"]
-        P: Float[Array, "K d B"]  # of `a`, as is what follows
-        D: Float[Array, "K d d B"]
-        slope: Float[Array, "n B"]
-        missed: Float[Array, " B"]
-        step: Int[Array, ""]
-
-    def look(a: Array) -> tuple[Array, Path]:
+    def look(a: Array) -> tuple[Array, _Look]:
         z = jnp.einsum("bij,jb->ib", V, a).reshape(k, d, batch)
         P, D = _project(allowed, z)
         value = jnp.sum(z**2 - (z - P) ** 2, axis=(0, 1)) / 2 - jnp.sum(b * a, axis=0)
         slope = jnp.einsum("bij,ib->jb", V, P.reshape(k * d, batch)) - b
         missed = jnp.where(singular, jnp.max(jnp.abs(slope), axis=0) / size, 0)
-        return value, Path(a, P, D, slope, missed, jnp.zeros((batch,), int))
+        return value, _Look(a, P, D, slope, missed)
 
-    def newton(path: Path) -> Array:
-        whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(path.D)
+    def newton(at: _Look) -> Array:
+        whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(at.D)
         whole = jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
         curvature = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
         # Flat directions: where all impulses along them are at an edge. The less, the nearer the end.
-        ridge = jnp.clip(0.01 * path.missed, 1e-10, 0.01)[:, None]
+        ridge = jnp.clip(0.01 * at.missed, 1e-10, 0.01)[:, None]
         curvature = curvature + jnp.where(counts, ridge, 1)[..., None] * eye
-        return -jnp.linalg.solve(curvature, path.slope.T[..., None])[..., 0].T
+        return -jnp.linalg.solve(curvature, at.slope.T[..., None])[..., 0].T
 
-    def keep_going(path: Path):
-        return (path.step <= _STEPS) & jnp.any(path.missed > _FOUND)
+    def keep_going(state):
+        at, step = state
+        return (step <= _STEPS) & jnp.any(at.missed > _FOUND)
 
-    def body(path: Path) -> Path:
-        # The first time there is no step, only a look at the start.
-        change = jax.lax.cond(path.step > 0, newton, lambda path: jnp.zeros_like(path.a), path)
-        values, looks = jax.vmap(lambda length: look(path.a + length * change))(lengths)
+    def body(state):
+        at, step = state
+        # The first time there is no step, only a look at the start. All is computed for each length, and so written
+        # once: to compile it costs more than to run it.
+        change = jax.lax.cond(step > 0, newton, lambda at: jnp.zeros_like(at.a), at)
+        values, looks = jax.vmap(lambda length: look(at.a + length * change))(lengths)
         chosen = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0)
         # Near the end values differ by rounding alone.
-        chosen = jnp.where(path.missed < 1e-6, 0, chosen)
-        return pick(looks, chosen)._replace(step=path.step + 1)
+        return pick(looks, jnp.where(at.missed < 1e-6, 0, chosen)), step + 1
 
     unknown = jnp.where(singular, jnp.inf, 0).astype(y.dtype)
-    start = Path(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown, jnp.asarray(0))
-    end = jax.lax.while_loop(keep_going, body, start)
+    start = _Look(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown)
+    end, _ = jax.lax.while_loop(keep_going, body, (start, jnp.asarray(0)))
     return jnp.where(singular & (end.missed < 1e-9), end.P, y)
