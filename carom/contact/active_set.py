@@ -139,10 +139,10 @@ _NEWTON_STEPS = 4
 _UNROLLED = 8
 
 
-def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
+def sweep(problem: Problem, mu: Float[Array, "K B"], present: Bool[Array, "K B"]) -> Float[Array, "K d B"]:
     """An impulse near the solution, by projected Gauss-Seidel in the metric of `(f_n, f_t)`.
 
-    In single precision, which is enough to see the active set.
+    In single precision, which is enough to see the active set. Contacts that are not `present` have no impulse.
     """
     k, d, batch = problem.q.shape
     dtype = problem.q.dtype
@@ -165,8 +165,11 @@ def sweep(problem: Problem, mu: Float[Array, "K B"]) -> Float[Array, "K d B"]:
         shrunk = moved * jnp.minimum(1, normal / jnp.maximum(length, TINY))
         return y.at[i].set(jnp.where(jnp.arange(d)[:, None] == 0, normal, shrunk))
 
+    written_out = k <= _UNROLLED and batch > FEW
+    count = k if written_out else jnp.max(jnp.where(present, jnp.arange(1, k + 1)[:, None], 0), initial=0)
+
     def body(_, y: Array) -> Array:
-        return jax.lax.fori_loop(0, k, contact, y, unroll=k <= _UNROLLED and batch > FEW)
+        return jax.lax.fori_loop(0, count, contact, y, unroll=written_out or None)
 
     return jax.lax.fori_loop(0, _SWEEPS, body, jnp.zeros_like(problem.q)).astype(dtype)
 

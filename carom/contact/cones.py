@@ -149,7 +149,7 @@ _CLEAR = 1e3  # times the diagonal
 
 
 def _short_way(problem: Problem, scales: Scales, settings: ConeSettings) -> tuple[_Solved, Factored]:
-    last = newton_steps(problem, sweep(problem, scales.mu), scales.regularization, scales.apex)
+    last = newton_steps(problem, sweep(problem, scales.mu, scales.size > 0), scales.regularization, scales.apex)
     of_regular, of_solution = jax.vmap(residual_of, in_axes=(None, 0, 0))(
         problem,
         jnp.stack([last.regular, last.y]),
