@@ -7,7 +7,7 @@ from systems import refused
 from trajectory_files import a_recording, content, write
 
 import carom
-from carom.simulation.observations import Observations, load_observations, save_observations
+from carom.recordings.observations import Observations, load_observations, save_observations
 
 NAN = np.nan
 POINT = carom.System(bodies=[carom.PointMass(1.0)])
