@@ -100,7 +100,7 @@ class Observations(NamedTuple):
             f"{length[bad][:1].sum()}. Leave it out.",
         )
         valid = np.arange(x.shape[1]) < length[:, None]
-        flags = None if contact is None else as_flags(contact, x.shape) & valid
+        flags = None if contact is None else as_flags("contact", contact, x.shape[:2]) & valid
         groups = None if group is None else _names(group, len(x))
         times = _grown(times, np.asarray(time), valid, digit)
         gone = ~valid[:, : length.max()]
@@ -269,7 +269,7 @@ def _taken(content: dict[str, Any]) -> dict[str, Any]:
     out = {name: content[name] for name in names if name in content}
     if "mask" in content:
         require("seen" not in out, "seen and mask must not both be there: leave one out.")
-        out["seen"] = ~as_mask("mask", content["mask"])
+        out["seen"] = ~as_flags("mask", content["mask"])
     if "time" not in out:
         require("dt" in content, "time and dt are both missing; give time (s), (time,) or (trajectory, time).")
         out["time"] = content["dt"] * np.arange(as_states("x", out["x"]).shape[1])
@@ -303,24 +303,12 @@ def _named(part: Observations, name: str) -> tuple[str, ...]:
 # --- checks -----------------------------------------------------------------------------------------------------------
 
 
-def as_mask(name: str, value: Any) -> Bool[np.ndarray, "..."]:
-    """An array of true and false, or of 0 and 1."""
-    array = np.asarray(value)
-    good = array.dtype.kind == "b" or (array.dtype.kind in "iu" and bool(np.isin(array, (0, 1)).all()))
-    require(good, f"{name} must hold true and false; it was {array.dtype}. Convert it to bool.")
-    return array.astype(bool)
-
-
 def _left_out(x: Float[np.ndarray, "N T n d"], seen: Any) -> Float[np.ndarray, "N T n d"]:
     """With NaN for all axes of a point that was not seen, or of which an axis is missing."""
     # The infinite is kept, and reported with its place.
     kept = np.asarray(np.isfinite(x).all(axis=3) | np.isinf(x).any(axis=3))
     if seen is not None:
-        flags = np.asarray(as_mask("seen", seen))
-        require(
-            flags.shape in (x.shape[:2], x.shape[:3]),
-            f"seen (or mask) must have the shape {x.shape[:2]} or {x.shape[:3]}; it was {flags.shape}.",
-        )
+        flags = np.asarray(as_flags("seen (or mask)", seen, x.shape[:2], x.shape[:3]))
         kept &= flags.reshape(*flags.shape, *[1] * (3 - flags.ndim))
     return np.where(kept[..., None], x, np.nan)
 

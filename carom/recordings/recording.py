@@ -77,7 +77,7 @@ class Recording(eqx.Module):
         _check_finite("x", x, valid, STATE_AXES)
         _check_finite("v", v, valid, STATE_AXES)
         time, dt = _clock(time, dt, valid)
-        contact = None if contact is None else as_flags(contact, x.shape)
+        contact = None if contact is None else as_flags("contact", contact, x.shape[:2])
         group = None if group is None else as_groups(group, x.shape[0])
         texts = {"units": units, "task": task, "source": source, "carom_version": carom_version}
         texts = {name: plain_text(name, text) for name, text in texts.items()}
@@ -185,15 +185,15 @@ def as_lengths(value: Any, shape: tuple[int, ...]) -> Int64[np.ndarray, " N"]:
     return array.astype(np.int64)
 
 
-def as_flags(value: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
-    """Flags of the samples of states of this shape; `CaromError` if they are not."""
+def as_flags(name: str, value: Any, *shapes: tuple[int, ...]) -> Bool[np.ndarray, "..."]:
+    """Flags, in one of these shapes if any are given; `CaromError` if they are not."""
     array = np.asarray(value)
-    wanted = f"have the shape {shape[:2]}, a flag for each sample of x"
-    require_part(array.shape == shape[:2], "contact", wanted, array.shape, "correct or remove it")
+    good = not shapes or array.shape in shapes
+    wanted = f"have the shape {' or '.join(map(str, shapes))}, a flag for each sample of x"
+    require_part(good, name, wanted, array.shape, "correct or remove it")
     kind = array.dtype.kind
     good = kind == "b" or (kind in "iu" and bool(np.isin(array, (0, 1)).all()))
-    wanted = "hold true and false, or 0 and 1"
-    require_part(good, "contact", wanted, array.dtype, "convert it to bool or remove it")
+    require_part(good, name, "hold true and false, or 0 and 1", array.dtype, "convert it to bool or remove it")
     return array.astype(bool)
 
 
