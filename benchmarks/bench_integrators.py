@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from carom.learning.models import NeuralPotential
+from carom.learning.unknowns.models import NeuralPotential
 from carom.simulation.integrators import RK4, flow
 
 

@@ -37,9 +37,9 @@ from carom.cli.main import configure_jax
 from carom.learning.config import Quantity
 from carom.learning.dataset import Dataset
 from carom.learning.estimation.estimate import estimate
-from carom.learning.identify import Identification, identify
-from carom.learning.models import mass_ratios
-from carom.simulation.observations import Observations
+from carom.learning.estimation.identify import Identification, identify
+from carom.learning.unknowns.models import mass_ratios
+from carom.recordings.observations import Observations
 
 
 def noisy(recording: carom.Recording, sd: float, seed: int) -> carom.Recording:

@@ -6,10 +6,10 @@ import pytest
 
 import carom
 from carom.learning.dataset import Dataset
+from carom.learning.estimation.identify import identify
 from carom.learning.evaluate import evaluate
-from carom.learning.identify import identify
-from carom.learning.models import mass_ratios
-from carom.learning.train import learn
+from carom.learning.training.train import learn
+from carom.learning.unknowns.models import mass_ratios
 from carom.tasks import make_data_sets
 
 

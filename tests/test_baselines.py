@@ -11,7 +11,11 @@ from systems import ball_on_floor, refused, two_bodies
 
 import carom
 from carom.contact.impulses import ContactModel, Jump
-from carom.learning.baselines import (
+from carom.learning.dataset import Chunks, Dataset
+from carom.learning.training.loss import train_step
+from carom.learning.training.optimizer import Rates
+from carom.learning.training.train import fresh_state, learn
+from carom.learning.unknowns.baselines import (
     BASELINES,
     InteractionContact,
     InteractionNetwork,
@@ -22,11 +26,7 @@ from carom.learning.baselines import (
     rebuild_baseline,
     with_baseline,
 )
-from carom.learning.baselines.graph import WORLD, Graph
-from carom.learning.dataset import Chunks, Dataset
-from carom.learning.loss import train_step
-from carom.learning.optimizer import Rates
-from carom.learning.train import fresh_state, learn
+from carom.learning.unknowns.baselines.graph import WORLD, Graph
 from carom.simulation.impact import Stepper, contact_jump
 from carom.simulation.rollout import step
 

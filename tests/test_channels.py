@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from systems import refused
 
-from carom.simulation.channels import Channel, fit_channel, observe
+from carom.recordings.channels import Channel, fit_channel, observe
 
 TIME = np.linspace(0, 2, 200)
 

@@ -15,11 +15,11 @@ from systems import ball_on_floor, refused
 import carom
 from carom.contact.impulses import CONTACT_MODELS
 from carom.learning.dataset import Chunks, contact_flags
-from carom.learning.loss import train_step
 from carom.learning.model_file import read_model_header
-from carom.learning.optimizer import Rates
 from carom.learning.run import RunFolder
-from carom.learning.train import fresh_state, learn
+from carom.learning.training.loss import train_step
+from carom.learning.training.optimizer import Rates
+from carom.learning.training.train import fresh_state, learn
 from carom.simulation.impact import Stepper
 from carom.simulation.rollout import simulate
 

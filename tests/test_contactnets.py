@@ -10,8 +10,8 @@ import pytest
 from systems import refused
 
 from carom.cli.main import main
-from carom.simulation import contactnets
-from carom.simulation.poses import load_poses
+from carom.recordings import contactnets
+from carom.recordings.poses import load_poses
 
 PICKLE = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
 

@@ -7,7 +7,7 @@ import pytest
 
 import carom
 from carom.errors import CaromError
-from carom.simulation.csv_files import DIFFERENCES
+from carom.recordings.csv_files import DIFFERENCES
 
 GOOD = """# two trajectories of a point
 trajectory,time,x0,y0,vx0,vy0,contact

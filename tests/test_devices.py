@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from carom.errors import CaromError
-from carom.learning.devices import start_processes
+from carom.learning.training.devices import start_processes
 
 TRAIN = """
 import sys
@@ -23,9 +23,9 @@ jax.config.update("jax_compilation_cache_dir", None)
 import carom
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset
-from carom.learning.devices import is_first, start_processes
+from carom.learning.training.devices import is_first, start_processes
 from carom.learning.run import CONFIG, RunFolder
-from carom.simulation.recording import Recording
+from carom.recordings.recording import Recording
 
 folder, epochs, resume = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "resume"
 if len(sys.argv) > 4:

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from systems import refused
 
-from carom.learning.identify import Estimate, Identification
+from carom.learning.estimation.identify import Estimate, Identification
 from carom.view.estimates import _limits, _panel, draw_estimates
 from carom.view.style import BLUE, MUTED, new_figure, theme
 

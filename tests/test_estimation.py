@@ -16,7 +16,7 @@ from carom.learning.estimation.estimate import estimate
 from carom.learning.estimation.windows import survey, windows_of
 from carom.learning.model_file import load_model_into
 from carom.learning.run import RunFolder
-from carom.simulation.observations import Observations
+from carom.recordings.observations import Observations
 
 TRUE = Pucks(friction=(0.17, 0.08), restitution=(0.82, 0.65), field=(0.1, -0.3))
 LEARN = ("friction", "restitution", "mass", "gravity", "radius:1", "plane:1")

@@ -15,8 +15,8 @@ from hypothesis.extra import numpy as hnp
 from trajectory_files import ARRAYS, ATTRIBUTES, STATES, SUFFIXES, a_recording, assert_same, content, write
 
 from carom.errors import CaromError
-from carom.simulation.files import load_recording, save_recording
-from carom.simulation.recording import Recording
+from carom.recordings.files import load_recording, save_recording
+from carom.recordings.recording import Recording
 
 # ------------------------------------------------------------------------------------- round trips
 
@@ -307,8 +307,8 @@ def test_permissions_are_those_of_any_new_file(tmp_path):
 WRITER = """
 import os, random, signal, sys, time
 import numpy as np
-from carom.simulation.files import save_recording
-from carom.simulation.recording import Recording
+from carom.recordings.files import save_recording
+from carom.recordings.recording import Recording
 
 def write_forever(path):
     for k in range(10**9):

@@ -13,7 +13,7 @@ from systems import ball_on_floor
 import carom
 from carom.errors import CaromError
 from carom.learning.model_file import load_model_into, read_model_header
-from carom.simulation.files import load_recording
+from carom.recordings.files import load_recording
 
 EXAMPLES = int(os.environ.get("CAROM_FUZZ", "150"))
 

@@ -10,11 +10,11 @@ import pytest
 from systems import refused
 
 import carom
-from carom.learning.identify import identify
-from carom.learning.models import NeuralPotential
-from carom.learning.parameters import unknowns_of
-from carom.learning.refine import Fit, choose_steps, polish
-from carom.learning.robust import Blocks, solve
+from carom.learning.estimation.identify import identify
+from carom.learning.estimation.refine import Fit, choose_steps, polish
+from carom.learning.estimation.robust import Blocks, solve
+from carom.learning.unknowns.models import NeuralPotential
+from carom.learning.unknowns.parameters import unknowns_of
 from carom.simulation.impact import Stepper
 
 CONTACT = ("friction", "restitution")
@@ -116,7 +116,7 @@ def test_impacts_that_no_sample_shows_tell_nothing(monkeypatch):
     with refused("impacts happen between the samples"):
         identify(truth, data, learned=CONTACT)
     # Even if that were not found out: the model predicts impacts, but the data have none.
-    monkeypatch.setattr("carom.learning.identify.check_meetings", lambda recording, system: None)
+    monkeypatch.setattr("carom.learning.estimation.identify.check_meetings", lambda recording, system: None)
     found = identify(truth, data, learned=CONTACT)
     assert found.impacts == found.used == [0, 0]
     assert {e.verdict for name in CONTACT for e in getattr(found, name)} == {"not identified"}

@@ -9,8 +9,8 @@ from systems import refused
 
 import carom
 from carom.learning.config import LearnConfig
-from carom.learning.inspection import inspect_recording
-from carom.simulation.recording_checks import check_recording, compare_rates, position_noise, step_motion
+from carom.learning.estimation.inspection import inspect_recording
+from carom.recordings.recording_checks import check_recording, compare_rates, position_noise, step_motion
 
 BALL = carom.System(
     bodies=[carom.PointMass(mass=1.0, radius=0.1)],

@@ -7,7 +7,7 @@ from systems import refused
 
 import carom
 from carom.cli.main import main
-from carom.learning.inspection import inspect_recording
+from carom.learning.estimation.inspection import inspect_recording
 from carom.learning.meetings import Meetings, meetings
 
 WALLS = carom.System(

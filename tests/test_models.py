@@ -10,8 +10,8 @@ import pytest
 
 import carom
 from carom.learning.model_file import load_model_into, read_model_header
-from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
-from carom.learning.optimizer import Rates, make_optimizer
+from carom.learning.training.optimizer import Rates, make_optimizer
+from carom.learning.unknowns.models import NeuralPotential, Unknowns, mass_ratios
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from carom.simulation.motion_events import motion_breaks
-from carom.simulation.motion_windows import series_of
-from carom.simulation.observations import Observations
+from carom.recordings.motion_events import motion_breaks
+from carom.recordings.motion_windows import series_of
+from carom.recordings.observations import Observations
 
 
 def observed(time, x) -> Observations:

@@ -6,9 +6,9 @@ from systems import refused
 
 import carom
 from carom.cli.main import main
-from carom.learning.inspection import inspect_observations, inspect_recording
-from carom.simulation.motion_impacts import body_points, impact_counts, motion_impacts
-from carom.simulation.observations import Observations, load_observations
+from carom.learning.estimation.inspection import inspect_observations, inspect_recording
+from carom.recordings.motion_impacts import body_points, impact_counts, motion_impacts
+from carom.recordings.observations import Observations, load_observations
 
 WALLS = """import carom
 system = carom.System(

@@ -7,7 +7,7 @@ from systems import refused
 from trajectory_files import a_recording, content, write
 
 import carom
-from carom.simulation.observations import Observations, load_observations, save_observations
+from carom.recordings.observations import Observations, load_observations, save_observations
 
 NAN = np.nan
 POINT = carom.System(bodies=[carom.PointMass(1.0)])
@@ -116,8 +116,11 @@ def test_other_times_stay_as_they_were_recorded():
         ({"x": np.full((2, 4, 1, 2), np.inf)}, "x must be finite, or NaN where nothing was seen; trajectory 0, sample"),
         ({"x": np.full((2, 4, 1, 2), NAN)}, "each trajectory must have 2 samples or more in which something was seen"),
         ({"v": np.zeros((2, 4, 2, 2))}, "v must have the shape of x, (2, 4, 1, 2); it was (2, 4, 2, 2)"),
-        ({"seen": np.ones((2, 3), bool)}, "seen (or mask) must have the shape (2, 4) or (2, 4, 1); it was (2, 3)"),
-        ({"seen": np.ones((2, 4))}, "seen must hold true and false; it was float64"),
+        (
+            {"seen": np.ones((2, 3), bool)},
+            "seen (or mask) must have the shape (2, 4) or (2, 4, 1), a flag for each sample of x; it was (2, 3)",
+        ),
+        ({"seen": np.ones((2, 4))}, "seen (or mask) must hold true and false, or 0 and 1; it was float64"),
         ({"group": ["a"]}, "group must name the session of each of 2 trajectories"),
         ({"time": np.zeros(3)}, "time must have the shape (4,), as x"),
     ],

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from test_cli import command, refused
 
 import carom
-from carom.simulation.pose_conventions import READINGS, Reading, check_convention
-from carom.simulation.poses import PoseRecording, load_poses, poses_of
+from carom.recordings.pose_conventions import READINGS, Reading, check_convention
+from carom.recordings.poses import PoseRecording, load_poses, poses_of
 
 RATE = 120
 RIGHT, LAST, BACK, BOTH = READINGS

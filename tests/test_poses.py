@@ -9,9 +9,9 @@ from systems import refused
 
 import carom
 from carom.mechanics.bodies import recover_velocity
-from carom.simulation.corner_impacts import mass_balance
-from carom.simulation.pose_checks import check_poses, find_copies, flight_noise
-from carom.simulation.poses import (
+from carom.recordings.corner_impacts import mass_balance
+from carom.recordings.pose_checks import check_poses, find_copies, flight_noise
+from carom.recordings.poses import (
     PoseRecording,
     flight_acceleration,
     free_flight,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from systems import ball_on_floor, disk, heavy_top, pendulum, refused, two_bodies
 
 import carom
-from carom.learning.quantities import Learned, describe, matches, quantities
+from carom.learning.unknowns.quantities import Learned, describe, matches, quantities
 from carom.mechanics.bodies import embed_pose
 
 UP = (0.0, 0.0, 1.0)

@@ -19,12 +19,12 @@ from carom.cli.main import main
 from carom.cli.systems import Chosen
 from carom.cli.tosses import _warn_if_far_off, nominal_width, touching_height
 from carom.cli.view import View
-from carom.learning.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
+from carom.learning.estimation.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
+from carom.learning.estimation.toss_config import CENTER, TossConfig, read_values, toss_quantities, with_values
+from carom.learning.estimation.tosses import choose_segments, learn_tosses, predict_tosses, prepared
 from carom.learning.run import RunFolder
-from carom.learning.toss_config import CENTER, TossConfig, read_values, toss_quantities, with_values
-from carom.learning.tosses import choose_segments, learn_tosses, predict_tosses, prepared
 from carom.mechanics.bodies import embed_pose, embed_velocity, recover_velocity
-from carom.simulation.poses import poses_of
+from carom.recordings.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
 HEIGHT = np.sqrt(3) / 2 * WIDTH

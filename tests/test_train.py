@@ -11,10 +11,10 @@ from systems import refused
 
 import carom
 from carom.learning.dataset import Dataset
-from carom.learning.models import NeuralPotential, Unknowns, mass_ratios
-from carom.learning.refine import can_be_refined
+from carom.learning.estimation.refine import can_be_refined
 from carom.learning.run import RunFolder
-from carom.learning.train import initial_unknowns, learn
+from carom.learning.training.train import initial_unknowns, learn
+from carom.learning.unknowns.models import NeuralPotential, Unknowns, mass_ratios
 
 TINY = carom.LearnConfig(
     epochs=4, chunks_per_epoch=32, batch_size=16, chunk_length=3, width=16, depth=1, checkpoint_every=1, refine=False

@@ -22,7 +22,7 @@ from systems import ball_on_floor
 import carom
 from carom.cli.main import main
 from carom.errors import CaromError
-from carom.simulation.files import save_recording
+from carom.recordings.files import save_recording
 from carom.view.motion import motion_of
 from carom.view.web_page import save_page
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from trajectory_files import ATTRIBUTES, STATES, SUFFIXES, a_recording, assert_same, changed, content, error_of, write
 
 from carom.errors import CaromError
-from carom.simulation.files import load_recording, save_recording
-from carom.simulation.recording import Recording
+from carom.recordings.files import load_recording, save_recording
+from carom.recordings.recording import Recording
 
 # ------------------------------------------------------------------------------------ wrong content
 

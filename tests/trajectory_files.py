@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from carom.errors import CaromError
-from carom.simulation.files import load_recording
-from carom.simulation.recording import Recording
+from carom.recordings.files import load_recording
+from carom.recordings.recording import Recording
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
 ARRAYS = ("x", "v", "time", "contact", "length", "group")

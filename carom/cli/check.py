@@ -11,13 +11,13 @@ from rich.console import Console
 from carom.cli.systems import observed_and_system
 from carom.cli.tables import findings_table, quantities_table, told_table
 from carom.errors import CaromError
-from carom.learning.identify import MOST_POINTS, identify
-from carom.learning.inspection import inspect_observations, inspect_recording
-from carom.simulation.files import load_recording
-from carom.simulation.observation_checks import check_observations
-from carom.simulation.observations import Observations
-from carom.simulation.recording import Recording
-from carom.simulation.recording_checks import Finding, check_recording
+from carom.learning.estimation.identify import MOST_POINTS, identify
+from carom.learning.estimation.inspection import inspect_observations, inspect_recording
+from carom.recordings.files import load_recording
+from carom.recordings.observation_checks import check_observations
+from carom.recordings.observations import Observations
+from carom.recordings.recording import Recording
+from carom.recordings.recording_checks import Finding, check_recording
 from carom.system import System
 
 

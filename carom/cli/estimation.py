@@ -17,12 +17,12 @@ from carom.cli.systems import Chosen
 from carom.learning.estimation.estimate import Told, estimate
 from carom.learning.estimation.verdict import Estimate, Fit
 from carom.learning.model_file import save_model
-from carom.learning.models import mass_ratios
 from carom.learning.progress import LoopProgress
 from carom.learning.run import MODEL, REPORT, SYSTEM, TRUTH, RunFolder
-from carom.simulation.files import save_recording
-from carom.simulation.observations import load_observations
-from carom.simulation.recording import Recording
+from carom.learning.unknowns.models import mass_ratios
+from carom.recordings.files import save_recording
+from carom.recordings.observations import load_observations
+from carom.recordings.recording import Recording
 from carom.simulation.rollout import Trajectory
 
 BY_ITSELF = ("friction", "restitution", "mass", "gravity")

@@ -14,8 +14,8 @@ from carom.cli.tosses import LearnedToss, measure
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, RunFolder
-from carom.simulation.files import load_recording
-from carom.simulation.recording import check_system
+from carom.recordings.files import load_recording
+from carom.recordings.recording import check_system
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,9 +13,9 @@ from carom.checks import require
 from carom.cli.arguments import FilePath
 
 if TYPE_CHECKING:
-    from carom.simulation.pose_conventions import Reading
-    from carom.simulation.poses import PoseRecording
-    from carom.simulation.recording_checks import Finding
+    from carom.recordings.pose_conventions import Reading
+    from carom.recordings.poses import PoseRecording
+    from carom.recordings.recording_checks import Finding
 
 Kind = Annotated[
     Literal["points", "poses", "contactnets"],
@@ -90,7 +90,7 @@ class Import:
 
     def _keep(self) -> None:
         """Write what was seen as it was recorded."""
-        from carom.simulation.observations import load_observations, save_observations
+        from carom.recordings.observations import load_observations, save_observations
 
         out = self.out or self.file.with_name(f"{self.file.stem}-trajectories.h5")
         check_writable(out)
@@ -112,7 +112,7 @@ class Import:
         )
 
     def _convert(self) -> None:
-        from carom.simulation import contactnets
+        from carom.recordings import contactnets
 
         out, console = self.out or Path("cube_tosses.npz"), Console()
         require(out.suffix == ".npz", f"--out must end in .npz; it was {out}.")
@@ -130,10 +130,10 @@ class Import:
 
     def _import(self) -> None:
         from carom.cli.tables import findings_table
-        from carom.simulation.files import save_recording
-        from carom.simulation.pose_checks import LATE, check_poses, flight_noise
-        from carom.simulation.pose_conventions import Reading
-        from carom.simulation.poses import at_samples, load_poses, velocity_lag, with_velocities
+        from carom.recordings.files import save_recording
+        from carom.recordings.pose_checks import LATE, check_poses, flight_noise
+        from carom.recordings.pose_conventions import Reading
+        from carom.recordings.poses import at_samples, load_poses, velocity_lag, with_velocities
 
         width = self.size
         require(
@@ -168,7 +168,7 @@ class Import:
 
     def _check_reading(self, poses: "PoseRecording", width: float, reading: "Reading") -> "Finding":
         """What the motion tells of how quaternions are written; `CaromError` if in another way than is assumed."""
-        from carom.simulation.pose_conventions import check_convention, options
+        from carom.recordings.pose_conventions import check_convention, options
 
         found = check_convention(poses, width, reading)
         given = (self.quaternion_order, self.quaternion_direction)

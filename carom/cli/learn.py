@@ -25,14 +25,14 @@ from carom.contact.impulses import contact_model_of
 from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Dataset, hold_out, in_pieces, sessions_of
-from carom.learning.devices import is_first, start_processes
+from carom.learning.estimation.tosses import TossConfig, can_learn_tosses
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
-from carom.learning.tosses import TossConfig, can_learn_tosses
-from carom.learning.train import LearnReport, learn, quantities
-from carom.simulation.files import load_recording, save_recording
-from carom.simulation.recording import Recording
+from carom.learning.training.devices import is_first, start_processes
+from carom.learning.training.train import LearnReport, learn, quantities
+from carom.recordings.files import load_recording, save_recording
+from carom.recordings.recording import Recording
 from carom.tasks import make_data_sets, noisy
 
 QUICK = {"trajectories": 100, "epochs": 20}

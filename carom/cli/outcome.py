@@ -8,14 +8,14 @@ from rich.console import Console
 
 from carom.cli.tables import property_names
 from carom.errors import CaromError
-from carom.learning.baselines import BASELINES
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import trajectory_of
+from carom.learning.estimation.identify import MOST_POINTS, Identification, identify
 from carom.learning.evaluate import far_off, state_errors
-from carom.learning.identify import MOST_POINTS, Identification, identify
 from carom.learning.run import TRUTH, RunFolder
-from carom.learning.train import quantities
-from carom.simulation.recording import Recording
+from carom.learning.training.train import quantities
+from carom.learning.unknowns.baselines import BASELINES
+from carom.recordings.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 

@@ -14,7 +14,7 @@ from carom.cli.arguments import CompensationSteps, ContactModelName, FilePath, F
 from carom.cli.systems import choose, learned_system
 from carom.learning.dataset import recording_of
 from carom.learning.run import MODEL
-from carom.simulation.files import load_recording, save_recording
+from carom.recordings.files import load_recording, save_recording
 from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.simulation.rollout import simulate
 from carom.tasks import find_task, sample

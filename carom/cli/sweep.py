@@ -26,7 +26,7 @@ from carom.cli.systems import Chosen, choose
 from carom.errors import CaromError
 from carom.learning.config import LearnConfig
 from carom.learning.run import CONFIG, REPORT, RunFolder, check_same_settings
-from carom.simulation.files import save_recording
+from carom.recordings.files import save_recording
 
 Objective = Literal["bounded_error", "trajectory_error", "trajectory_error_median", "trajectory_error_geometric"]
 DATABASE, SETTINGS, LOCK = "sweep.db", "sweep.json", "lock"

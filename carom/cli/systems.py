@@ -12,9 +12,9 @@ from carom.checks import require
 from carom.errors import CaromError
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, SYSTEM, RunFolder
-from carom.simulation.files import load_recording
-from carom.simulation.observations import Observations, load_observations, task_in
-from carom.simulation.recording import Recording
+from carom.recordings.files import load_recording
+from carom.recordings.observations import Observations, load_observations, task_in
+from carom.recordings.recording import Recording
 from carom.system import System
 from carom.tasks import TASKS, task
 

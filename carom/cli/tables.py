@@ -7,11 +7,11 @@ import numpy as np
 from rich.table import Table
 
 from carom.contact.impulses import CMr
-from carom.learning.baselines import physical_quantities
-from carom.learning.identify import Estimate, Identification
-from carom.learning.models import mass_ratios
-from carom.learning.quantities import describe
-from carom.simulation.recording_checks import Finding
+from carom.learning.estimation.identify import Estimate, Identification
+from carom.learning.unknowns.baselines import physical_quantities
+from carom.learning.unknowns.models import mass_ratios
+from carom.learning.unknowns.quantities import describe
+from carom.recordings.recording_checks import Finding
 from carom.system import System
 
 

@@ -17,9 +17,7 @@ from carom.checks import require
 from carom.cli.outcome import percent, say_unexplained
 from carom.cli.systems import Chosen, chosen_by
 from carom.learning.dataset import trajectory_of
-from carom.learning.evaluate import FAR_OFF
-from carom.learning.model_file import load_model_into, save_model
-from carom.learning.protocols import (
+from carom.learning.estimation.protocols import (
     Protocol,
     TossErrors,
     body_points,
@@ -30,10 +28,12 @@ from carom.learning.protocols import (
     protocol_starts,
     toss_errors,
 )
+from carom.learning.estimation.toss_config import CENTER, TossConfig
+from carom.learning.estimation.tosses import COMPENSATION, IMPACT, TossReport, learn_tosses, predict_tosses
+from carom.learning.evaluate import FAR_OFF
+from carom.learning.model_file import load_model_into, save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
-from carom.learning.toss_config import CENTER, TossConfig
-from carom.learning.tosses import COMPENSATION, IMPACT, TossReport, learn_tosses, predict_tosses
-from carom.simulation.recording import Recording
+from carom.recordings.recording import Recording
 from carom.system import System
 
 PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": 8.1e-4, **dict.fromkeys(CENTER, 0.0)}

@@ -20,14 +20,14 @@ from carom.cli.systems import Chosen, chosen_by, data_and_system
 from carom.cli.tosses import LearnedToss
 from carom.errors import CaromError
 from carom.learning.dataset import trajectory_of
+from carom.learning.estimation.protocols import body_points
+from carom.learning.estimation.tosses import COMPENSATION, toss_motions
 from carom.learning.evaluate import predict
 from carom.learning.model_file import load_model_into, read_model_header
-from carom.learning.protocols import body_points
 from carom.learning.run import CONFIG, MODEL, RunFolder
-from carom.learning.tosses import COMPENSATION, toss_motions
-from carom.simulation.files import load_recording
+from carom.recordings.files import load_recording
+from carom.recordings.recording import Recording, check_system
 from carom.simulation.impact import COMPENSATION_STEPS
-from carom.simulation.recording import Recording, check_system
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 from carom.view.extras import check_movies

@@ -5,7 +5,7 @@ from typing import Literal
 
 from carom.checks import require
 from carom.contact.impulses import CMr, contact_model_name, contact_model_of
-from carom.learning.baselines import BASELINES, Baseline
+from carom.learning.unknowns.baselines import BASELINES, Baseline
 from carom.mechanics.dynamics import Formulation
 from carom.simulation.impact import COMPENSATION_STEPS, check_compensation_steps
 from carom.system import System

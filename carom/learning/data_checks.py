@@ -7,8 +7,8 @@ from carom.checks import require
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset, closed_contacts
 from carom.learning.meetings import check_meetings
+from carom.recordings.recording import Recording, check_system
 from carom.simulation.impact import COMPENSATION_STEPS
-from carom.simulation.recording import Recording, check_system
 from carom.simulation.start_checks import through
 from carom.system import System
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from carom.checks import require
-from carom.simulation.recording import Recording
+from carom.recordings.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 

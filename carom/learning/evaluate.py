@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from carom.learning.baselines import physical_quantities
-from carom.learning.models import mass_ratios
+from carom.learning.unknowns.baselines import physical_quantities
+from carom.learning.unknowns.models import mass_ratios
 from carom.mechanics.dynamics import Formulation
+from carom.recordings.recording import Recording, check_system
+from carom.recordings.recording_checks import state_noise
 from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
-from carom.simulation.recording import Recording, check_system
-from carom.simulation.recording_checks import state_noise
 from carom.simulation.rollout import Trajectory, simulate
 from carom.system import System
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from carom.checks import require
 from carom.learning.dataset import all_gaps
-from carom.simulation.recording import Recording
+from carom.recordings.recording import Recording
 from carom.system import System
 
 CLEAR = 5.0

@@ -14,9 +14,9 @@ from carom.atomic import write_whole
 from carom.checks import require
 from carom.contact.impulses import CONTACT_MODELS, ContactModel, contact_model_name, contact_model_settings
 from carom.errors import CaromError
-from carom.learning.baselines import describe_baseline, rebuild_baseline
-from carom.learning.body_quantities import gravity_path, with_field
-from carom.learning.models import NeuralPotential
+from carom.learning.unknowns.baselines import describe_baseline, rebuild_baseline
+from carom.learning.unknowns.body_quantities import gravity_path, with_field
+from carom.learning.unknowns.models import NeuralPotential
 from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.system import System
 

@@ -17,13 +17,13 @@ import carom
 from carom.checks import require
 from carom.learning.config import BASELINES, FORMULATIONS, LearnConfig, Model
 from carom.learning.dataset import Dataset
+from carom.learning.estimation.identify import identify
+from carom.learning.estimation.refine import MOST_POINTS
 from carom.learning.evaluate import energy_errors, evaluate, mean_and_interval, state_errors
-from carom.learning.identify import identify
 from carom.learning.model_file import save_model
-from carom.learning.refine import MOST_POINTS
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
-from carom.learning.train import learn
-from carom.simulation.recording import Recording
+from carom.learning.training.train import learn
+from carom.recordings.recording import Recording
 from carom.system import System
 from carom.tasks import make_data_sets, noisy, task
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from carom.learning.config import Model
-from carom.learning.models import mass_ratios
+from carom.learning.unknowns.models import mass_ratios
 from carom.reproduction.jobs import Job
 from carom.tasks import task
 

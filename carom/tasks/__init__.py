@@ -13,8 +13,8 @@ from carom.checks import require
 from carom.contact.impulses import ContactModel, contact_model_name
 from carom.learning.dataset import recording_of
 from carom.learning.model_file import load_model_into, read_model_header
+from carom.recordings.recording import Recording
 from carom.simulation.impact import COMPENSATION_STEPS
-from carom.simulation.recording import Recording
 from carom.simulation.rollout import simulate
 from carom.system import System
 from carom.tasks.base import Task as Task

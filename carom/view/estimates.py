@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from carom.checks import require
-from carom.learning.identify import Estimate, Identification
+from carom.learning.estimation.identify import Estimate, Identification
 from carom.view.style import BLUE, GREEN, INK, MUTED, VERMILLION, figure_style, new_figure, save_png
 
 QUANTITIES = {

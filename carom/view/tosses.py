@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from carom.learning.protocols import TossErrors, body_points, lowest_corner
-from carom.simulation.recording import Recording
+from carom.learning.estimation.protocols import TossErrors, body_points, lowest_corner
+from carom.recordings.recording import Recording
 from carom.system import System
 from carom.view.style import BLUE, DASHES, INK, VERMILLION, figure_style, new_figure, save_png
 

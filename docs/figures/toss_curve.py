@@ -17,8 +17,8 @@ import carom
 from carom.atomic import write_whole
 from carom.cli.main import configure_jax
 from carom.cli.tosses import nominal_width
-from carom.learning.protocols import toss_errors
-from carom.learning.tosses import TossConfig, learn_tosses, predict_tosses
+from carom.learning.estimation.protocols import toss_errors
+from carom.learning.estimation.tosses import TossConfig, learn_tosses, predict_tosses
 from carom.view.style import BLUE, VERMILLION, figure_style, new_figure, save_png
 
 SIZES = (4, 8, 16, 32, 64, 128, 256)

@@ -30,9 +30,9 @@ from carom.learning.estimation.verdict import (
     telling,
 )
 from carom.learning.estimation.windows import Survey, Windows, survey, windows_of
-from carom.learning.quantities import Learned
+from carom.learning.unknowns.quantities import Learned
+from carom.recordings.observations import Observations
 from carom.simulation.impact import ImpactRule
-from carom.simulation.observations import Observations
 from carom.system import System
 
 HELD = 0.15

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.learning.quantities import Learned
+from carom.learning.unknowns.quantities import Learned
 from carom.simulation.events import closing_speed, hermite, touching
 from carom.simulation.impact import ImpactRule, Stepper
 from carom.simulation.projection import project_state

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from carom.learning.estimation.flow import Flow, Motion
+from carom.learning.estimation.robust import CUTOFF, newton_step
 from carom.learning.estimation.windows import Windows
-from carom.learning.robust import CUTOFF, newton_step
 
 Loss = Literal["convex", "redescending", "squares"]
 SETTLED = 0.1

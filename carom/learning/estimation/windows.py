@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from carom.simulation.clock import STEP_TOLERANCE, digit_of
-from carom.simulation.observations import Observations
+from carom.recordings.clock import STEP_TOLERANCE, digit_of
+from carom.recordings.observations import Observations
 
 REACH = 8
 """Samples from which the next is foretold."""
