@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
 from carom.contact.cone_algebra import matvec, pick
@@ -32,7 +32,7 @@ from carom.contact.coulomb_law import (
     softened,
     sound,
 )
-from carom.contact.least_norm import least_norm
+from carom.contact.least_norm import least_norm, may_be_redundant
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -149,101 +149,104 @@ _POLISHING = 2
 
 
 def _polish(problem: Problem, soft: Problem, y: Float[Array, "K d B"], steps: Bool[Array, ""]) -> Judged:
-    """`y` less what the diagonal has changed of the velocities, if that meets the law better, and if `steps`.
-
-    Then, of all impulses with the modes there, that of least norm, where it obeys the law.
-    """
+    """`y`, or, if `steps`, less what the diagonal has changed of the velocities, where that meets the law better."""
 
     def improve(count, best: Judged) -> Judged:
-        last = count == _POLISHING + 1
-
-        def least() -> Array:
-            u = matvec(problem.Q, best.y) + problem.q
-            return least_norm(problem.Q, problem.q, u, best.y, problem.mu, problem.lower)
-
-        def moved() -> Array:
-            return best.y + _step(soft, best.modes, steps & (count > 0))
-
-        new = judge(problem, jax.lax.cond(last, least, moved))
-        better = jnp.where(last, new.residual <= _SOLVED, new.residual < best.residual)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
+        new = judge(problem, best.y + _step(soft, best.modes, count > 0))
+        return jax.tree.map(lambda a, b: jnp.where(new.residual < best.residual, a, b), new, best)
 
     unknown = Judged(y, Modes.nothing(problem), jnp.full_like(y[0, 0], jnp.inf))
-    return jax.lax.fori_loop(0, _POLISHING + 2, improve, unknown)
+    return jax.lax.fori_loop(0, jnp.where(steps, _POLISHING + 1, 1), improve, unknown)
 
 
-class _Search(NamedTuple):
-    swept: Float[Array, "K d B"]
-    y: Float[Array, "K d B"]
+# --- Rounds -----------------------------------------------------------------------------------------------------
+
+
+class _Round(NamedTuple):
+    """Where the search for impulses is, batch first: where sweeps go on from, and the best so far (N s)."""
+
+    swept: Float[Array, "B K d"]
+    impulse: Float[Array, "B K d"]
     residual: Float[Array, " B"]
-    round: Int[Array, ""]
 
 
-def _search(problem: Problem, start: Float[Array, "K d B"], rounds: Int[Array, ""]) -> _Search:
-    """Rounds of sweeps and Newton steps from `start`, until every problem is solved."""
+def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count) -> _Round:
+    """Sweeps and Newton steps for one block of problems, batch first in and out; round 0 looks at the start.
+
+    Odd rounds take Newton steps at once; even ones come down from a large diagonal, with which there is one solution.
+    Sweeps, from round 2 on, are twice as many each time.
+    """
+    count = jnp.max(count, initial=0)
+    finite, (A, v, friction, lower, swept, impulse) = sound(A, v, friction, lower, swept, impulse)
+    problem, size, unit = scale(A, v, friction, lower, reference)
+    whole = size[:, None] * unit
+    swept, start = (jnp.moveaxis(x, 0, -1) / jnp.where(whole > 0, whole, jnp.inf) for x in (swept, impulse))
     soft = softened(problem)
-
-    def keep_going(search: _Search):
-        return (search.round < rounds) & jnp.any(search.residual > _SOLVED)
+    # What is just between two modes (a contact that sticks with all the friction it has, one that only touches) is seen
+    # as held, whatever rounding says.
+    held = start.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
+    swept = _sweep(soft, jnp.where(count <= 1, held, swept), jnp.where(count > 1, _SWEEPS * 2 ** (count - 1), 0))
 
     def smaller(state):
         y, delta = state
         return _newton(softened(problem, delta), y, _STEPS), delta / 10
 
-    def body(search: _Search) -> _Search:
-        # Round -1 looks at the start.
-        begun, again = search.round >= 0, search.round > 0
-        swept = _sweep(soft, search.swept, jnp.where(again, _SWEEPS * 2**search.round, 0))
-        # Every other round comes down from a large diagonal, with which there is one solution.
-        first = jnp.where(begun, jnp.where(again & (search.round % 2 == 0), 0.1, DELTA), 0).astype(swept.dtype)
-        y, _ = jax.lax.while_loop(lambda state: state[1] > 0.5 * DELTA, smaller, (swept, first))
-        new = _polish(problem, soft, y, begun)
-        better = ((new.residual < search.residual) & (search.residual > _SOLVED)) | ~begun
-        y = jnp.where(better, new.y, search.y)
-        # What is just between two modes (a contact that sticks with all the friction it has, one that only touches) is
-        # seen as held, whatever rounding says.
-        held = y.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
-        swept = jnp.where(begun, swept, held)
-        return _Search(swept, y, jnp.where(better, new.residual, search.residual), search.round + 1)
-
-    unknown = jnp.full_like(start[0, 0], jnp.inf)
-    return jax.lax.while_loop(keep_going, body, _Search(start, start, unknown, jnp.asarray(-1)))
+    first = jnp.where((count > 1) & (count % 2 == 1), 0.1, DELTA)
+    first = jnp.where(count > 0, first, 0).astype(swept.dtype)
+    y, _ = jax.lax.while_loop(lambda state: state[1] > 0.5 * DELTA, smaller, (swept, first))
+    new = _polish(problem, soft, jnp.where(count > 0, y, start), count > 0)
+    better = (new.residual < residual) | (count == 0)
+    y, worst = jnp.where(better, new.y, start), jnp.where(better, new.residual, residual)
+    nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
+    swept, y = (jnp.moveaxis(x, -1, 0) for x in (swept * whole, y * whole + nan))
+    return _Round(swept, y, jnp.where(finite, worst, jnp.inf))
 
 
-def _solve_block(A, v, friction, lower, reference, start, rounds) -> CoulombSolution:
-    """Solve one block of problems from `start` (N s), batch first in and out."""
-    finite, (A, v, friction, lower, start) = sound(A, v, friction, lower, start)
+def _of_least_norm(A, v, friction, lower, reference, impulse, residual) -> CoulombSolution:
+    """Of all impulses with the modes of a solution that of least norm, where it obeys the law; batch first."""
+    finite, (A, v, friction, lower, impulse) = sound(A, v, friction, lower, impulse)
     problem, size, unit = scale(A, v, friction, lower, reference)
     whole = size[:, None] * unit
-    start = jnp.moveaxis(start, 0, -1) / jnp.where(whole > 0, whole, jnp.inf)
-    found = _search(problem, start, jnp.max(rounds, initial=0))
+    y = jnp.moveaxis(impulse, 0, -1) / jnp.where(whole > 0, whole, jnp.inf)
+    least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
+    judged = judge(problem, least).residual
+    takes = finite & (judged <= _SOLVED)
     nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
-    return CoulombSolution(jnp.moveaxis(found.y * whole + nan, -1, 0), jnp.where(finite, found.residual, jnp.inf))
+    impulse = jnp.moveaxis(jnp.where(takes, least, y) * whole + nan, -1, 0)
+    return CoulombSolution(impulse, jnp.where(takes, judged, residual))
 
 
 def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
-    """Solve a batch block by block: problems without a contact cost nothing, those with few only their own room.
+    """Solve a batch in rounds, each of what is not solved yet, block by block.
 
-    What the first round does not solve is put together in blocks of its own.
+    Problems without a contact cost nothing, those with few only their own room.
     """
     batch, k, d = v.shape
     used = contacts_used(A, k)
     start = solve_cones(A, v, friction, lower, reference)
-    out = CoulombSolution(
-        impulse=jnp.zeros((batch, k, d), v.dtype), residual=jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
-    )
+    start = jnp.where(jnp.isfinite(start), start, 0)
 
-    def one_pass(count, out: CoulombSolution) -> CoulombSolution:
-        rounds = jnp.full(batch, jnp.where(count == 0, 1, _ROUNDS))
-        for size, chosen in by_size(used, k):
+    def in_blocks(solve, found, chosen, out, forms, *more):
+        for size, its in forms:
             m = size * d
-            arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
-            missing = chosen & ~(out.residual <= _SOLVED)
+            arrays = (A[:, :m, :m], *(x[:, :size] for x in (v, friction, lower, reference)))
+            arrays += tuple(x[:, :size] if x.ndim > 1 else x for x in (*found, *more))
             block = next((size for most, size in BLOCK.items() if m <= most), 32)
-            out = solve_chosen(_solve_block, (*arrays, start[:, :size], rounds), missing, block, out)
+            out = solve_chosen(solve, arrays, chosen & its, block, out)
         return out
 
-    return jax.lax.fori_loop(0, 2, one_pass, out)
+    def one_round(state):
+        count, found = state
+        missing = ~(found.residual <= _SOLVED)
+        return count + 1, in_blocks(_one_round, found, missing, found, by_size(used, k), jnp.full(batch, count))
+
+    def keep_going(state):
+        return (state[0] <= _ROUNDS) & jnp.any(~(state[1].residual <= _SOLVED))
+
+    unknown = jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
+    _, found = jax.lax.while_loop(keep_going, one_round, (jnp.asarray(0), _Round(start, start, unknown)))
+    solution = CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
+    return in_blocks(_of_least_norm, solution, may_be_redundant(A, k), solution, [(k, used > 1)])
 
 
 _batched = as_one_batch(_solve_batch, "solver of Coulomb's law")

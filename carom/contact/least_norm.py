@@ -32,6 +32,8 @@ from carom.contact.cone_algebra import dot, pick
 
 _SINGULAR = 1e-9
 """Singular values below this share of the largest one are zero."""
+_REGULAR = 1e-6
+"""Matrices whose pivots are all above this share of their diagonals have none."""
 _STILL = 1e-7
 """Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
 _STEPS = 80
@@ -57,6 +59,16 @@ class _Look(NamedTuple):
     D: Float[Array, "K d d B"]
     slope: Float[Array, "n B"]  # phi'
     missed: Float[Array, " B"]  # by it, where that matters
+
+
+def may_be_redundant(A: Float[Array, "B n n"], contacts: int) -> Bool[Array, " B"]:
+    """Whether some of the contacts (`A` of their scales, padding zeros) may be: by the least pivot, diagonals of 1."""
+    own = jnp.diagonal(A, axis1=1, axis2=2)
+    size = jnp.where(own > 0, jax.lax.rsqrt(jnp.where(own > 0, own, 1)), 0)
+    padding = jnp.where(own > 0, 0, 1)[:, None] * jnp.eye(A.shape[1], dtype=A.dtype)
+    pivots = jnp.diagonal(jnp.linalg.cholesky(size[:, :, None] * A * size[:, None] + padding), axis1=1, axis2=2)
+    several = jnp.sum(own[:, :: A.shape[1] // contacts] > 0, axis=1) > 1
+    return several & ~(jnp.min(pivots, axis=1) ** 2 > _REGULAR)
 
 
 def _project(allowed: _Set, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K d B"], Float[Array, "K d d B"]]:
