@@ -5,7 +5,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Int
 
 SMALL = 2
@@ -74,22 +73,8 @@ def _solve_all(solve_block: Callable[..., Any], arrays: tuple[Array, ...], chose
     return jax.tree.map(put, out, solve_block(*(jnp.where(mine(x), x, jnp.zeros_like(x)) for x in arrays)))
 
 
-_SOLVED = "what a solver has found"
-
-
-def recomputed(body: Callable[..., Any]) -> Callable[..., Any]:
-    """`body` of a loop, of which the derivative keeps what solvers have found, and computes the rest again.
-
-    To keep all of it, in loops within loops, takes more time to compile than the rest of the derivative.
-    """
-    policy = jax.checkpoint_policies.save_only_these_names(_SOLVED)
-    return jax.checkpoint(body, policy=policy, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
-
-
-def as_one_batch(solve: Callable[..., Any], name: str, *, kept: bool = True) -> Callable[..., Any]:
+def as_one_batch(solve: Callable[..., Any], name: str) -> Callable[..., Any]:
     """`solve` of batch-first arrays, such that its batching under vmap is one larger batch.
-
-    `kept`: what it finds is not computed again where that of loops is, see `recomputed`.
 
     It is what a derivative rule calls, and has no derivative of its own: asking for one says that `name` has none.
     """
@@ -120,12 +105,7 @@ def as_one_batch(solve: Callable[..., Any], name: str, *, kept: bool = True) -> 
             "Use a Gauss-Newton approximation, or differences of gradients, in place of second derivatives."
         )
 
-    def solver(*arrays):
-        # Named out here: within a rule of its own the name would not be seen.
-        out = undifferentiated(*arrays)
-        return jax.tree.map(lambda x: checkpoint_name(x, _SOLVED), out) if kept else out
-
-    return solver
+    return undifferentiated
 
 
 def anywhere(flag: Bool[Array, ""]) -> Bool[Array, ""]:

@@ -250,7 +250,7 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
 
 
 _batched = as_one_batch(_solve_batch, "solver of Coulomb's law")
-_sensitivity = as_one_batch(sensitivity_of, "solver of Coulomb's law", kept=False)
+_sensitivity = as_one_batch(sensitivity_of, "solver of Coulomb's law")
 
 
 @jax.custom_jvp

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from carom.checks import is_known, not_negative, require, require_values
-from carom.contact.batching import recomputed
 from carom.contact.cones import ConeSettings, solve_cone_problem
 from carom.contact.coulomb import solve_coulomb_problem
 
@@ -112,7 +111,7 @@ def two_phases(
         lower = restitution * jnp.maximum(solution.impulse[..., 0], 0)
         return (velocity + change, lower), solution
 
-    _, solutions = jax.lax.scan(recomputed(phase), (v, jnp.zeros_like(friction)), jnp.array([False, True]))
+    _, solutions = jax.lax.scan(phase, (v, jnp.zeros_like(friction)), jnp.array([False, True]))
     return jax.tree.map(lambda s: s[0], solutions), jax.tree.map(lambda s: s[1], solutions)
 
 

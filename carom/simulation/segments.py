@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.contact.batching import anywhere, recomputed
+from carom.contact.batching import anywhere
 from carom.contact.energy import dissipative, islands
 from carom.contact.impulses import ContactState, Jump
 from carom.contact.penetration import pushes
@@ -179,7 +179,7 @@ class _Stepping:
             state, held = self.act(state, change, first, count)
             return jax.lax.cond(first, lambda: self.move(state, held, now, count), lambda: state), None
 
-        end, _ = jax.lax.scan(recomputed(end_of), start, jnp.array([True, False]))
+        end, _ = jax.lax.scan(end_of, start, jnp.array([True, False]))
         return _Progress(
             x=end.x,
             v=end.v,
@@ -263,7 +263,7 @@ class _Stepping:
             return acting._replace(velocity=velocity, change=acting.change + impulse), jump
 
         acting, jumps = jax.lax.scan(
-            recomputed(part), Acting(before, jnp.zeros_like(past), jnp.zeros_like(state.v)), jnp.array([False, True])
+            part, Acting(before, jnp.zeros_like(past), jnp.zeros_like(state.v)), jnp.array([False, True])
         )
         hit_jump = jax.tree.map(lambda a: a[1], jumps)
         wanted = jnp.zeros_like(state.pressing).at[index].add(jnp.where(held[:, None], acting.change, 0))
