@@ -33,6 +33,7 @@ from carom.contact.cone_algebra import (
 )
 from carom.contact.interior_point import interior_point
 from carom.contact.least_norm import least_norm
+from carom.contact.selection import selected
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -191,7 +192,8 @@ def _last_matrix(problem: Problem, scales: Scales, settings: ConeSettings, found
     if settings.smoothing > 0:
         scaling, bound = Scaling.of(found.it.y, found.it.z), found.it.w / found.it.u
     else:
-        active = ActiveSet.at(problem, found.regular, scales.apex)
+        proximal = problem._replace(q=problem.q - scales.regularization * found.center)
+        active = ActiveSet.at(proximal, found.regular, scales.apex)
         scaling, bound = active.scaling, active.curvature
     return NewtonMatrix(problem.Q, scaling, bound, unrolled=False).factored()
 
@@ -244,7 +246,7 @@ def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, fou
     plain = problem.Q - scales.regularization.reshape(k * d, 1, batch) * eye
     Q, q = rows[:, None] * plain * rows, over * problem.q
     u = over * matvec(plain, found.y) + q
-    least = over * least_norm(Q, q, u, ways * found.y, scales.mu, jnp.maximum(problem.lower, 0), lifts=True)
+    least = over * least_norm(Q, q, u, ways * found.y, scales.mu, jnp.maximum(problem.lower, 0), lifts=True).y
     residual = residual_of(problem, least, scales.regularization)
     takes = residual <= jnp.maximum(_wanted(settings), found.residual)
     return found._replace(y=jnp.where(takes, least, found.y), residual=jnp.where(takes, residual, found.residual))
@@ -363,6 +365,8 @@ def _impulse_jvp(settings, primals, tangents):
     rhs = -(dS_after + _friction_scale(force, friction))
     rhs = jnp.concatenate([rhs[..., :1] + (out.bound * dlower)[..., None] + boundary, rhs[..., 1:]], axis=-1)
     df = dSy + _friction_scale(out.solve(rhs), friction)
+    if settings.smoothing == 0 and f.dtype == jnp.float64:
+        df = selected(primals[:-1], solution.impulse, df, tangents[:-1], lifts=True)
     no_tangent = np.zeros(solution.iterations.shape, jax.dtypes.float0)
     return solution, _Internal(df, jnp.zeros_like(solution.residual), no_tangent)
 

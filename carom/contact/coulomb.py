@@ -33,6 +33,7 @@ from carom.contact.coulomb_law import (
     sound,
 )
 from carom.contact.least_norm import least_norm, may_be_redundant
+from carom.contact.selection import selected
 
 # --- The method -------------------------------------------------------------------------------------------------
 #
@@ -196,10 +197,10 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count
     y, _ = jax.lax.while_loop(lambda state: state[1] > 0.5 * DELTA, smaller, (swept, first))
     new = _polish(problem, soft, jnp.where(count > 0, y, start), count > 0)
     better = (new.residual < residual) | (count == 0)
-    y, worst = jnp.where(better, new.y, start), jnp.where(better, new.residual, residual)
+    y, worst = (jnp.asarray(jnp.where(better, a, b)) for a, b in ((new.y, start), (new.residual, residual)))
     nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
     swept, y = (jnp.moveaxis(x, -1, 0) for x in (swept * whole, y * whole + nan))
-    return _Round(swept, y, jnp.where(finite, worst, jnp.inf))
+    return _Round(swept, y, jnp.asarray(jnp.where(finite, worst, jnp.inf)))
 
 
 def _of_least_norm(A, v, friction, lower, reference, impulse, residual) -> CoulombSolution:
@@ -208,12 +209,12 @@ def _of_least_norm(A, v, friction, lower, reference, impulse, residual) -> Coulo
     problem, size, unit = scale(A, v, friction, lower, reference)
     whole = size[:, None] * unit
     y = jnp.moveaxis(impulse, 0, -1) / jnp.where(whole > 0, whole, jnp.inf)
-    least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
+    least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower).y
     judged = judge(problem, least).residual
     takes = finite & (judged <= _SOLVED)
     nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
     impulse = jnp.moveaxis(jnp.where(takes, least, y) * whole + nan, -1, 0)
-    return CoulombSolution(impulse, jnp.where(takes, judged, residual))
+    return CoulombSolution(impulse, jnp.asarray(jnp.where(takes, judged, residual)))
 
 
 def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
@@ -262,7 +263,8 @@ def _impulse(A, v, friction, lower, reference) -> CoulombSolution:
 #
 #     (dH/dy + dH/du A) df = -( dH/du (dA f + dv) + dH/dmu dmu + dH/dlower dlower )
 #
-# The matrix is that of the last Newton step, in scaled impulses. Everything on the right is linear in the tangents, so
+# The matrix is that of the last Newton step, in scaled impulses. Where contacts are redundant it gives the velocities;
+# which of the impulses it is, `selection.py` says. Everything on the right is linear in the tangents, so
 # that both modes, vmap and jit follow from this rule.
 @_impulse.defjvp
 def _impulse_jvp(primals, tangents):
@@ -274,8 +276,9 @@ def _impulse_jvp(primals, tangents):
     rhs = jnp.einsum("bkij,bkj->bki", out.by_velocity, change)
     rhs = rhs + out.by_friction * dfriction[..., None] + out.by_bound * dlower[..., None]
     batch, k, d = f.shape
-    y = jnp.linalg.solve(out.matrix, -rhs.reshape(batch, k * d, 1)).reshape(f.shape)
-    return solution, CoulombSolution(y * out.size[..., None], jnp.zeros_like(solution.residual))
+    df = jnp.linalg.solve(out.matrix, -rhs.reshape(batch, k * d, 1)).reshape(f.shape) * out.size[..., None]
+    df = selected(primals[:-1], f, df, tangents[:-1], lifts=False)
+    return solution, CoulombSolution(df, jnp.zeros_like(solution.residual))
 
 
 def solve_coulomb_problem(

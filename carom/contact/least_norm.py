@@ -4,9 +4,10 @@ Where contacts are redundant (`A` is singular) many impulses `y` within the fric
 `u = Q y + q` the modes of a solution (which contacts are open, stick, and slide where to) say what the others may be: a
 convex set `Y`, a product over the contacts, and a plane,
 
-    open        y_n = lower, |y_t| <= mu lower
-    sticking    y_n >= lower, |y_t| <= mu y_n,                  u_n = 0, u_t = 0
-    sliding     y_n >= lower, y_t = -mu y_n u_t / |u_t|,        u_n = 0
+    open        y_n = lower,                                    u_n > 0
+    closed      y_n >= lower,                                   u_n = 0
+    sticking    |y_t| <= mu y_n,                                u_t = 0
+    sliding     y_t = -mu y_n u_t / |u_t|
 
 The one of least norm in both, the projection of zero, is unique. With `Q` and `y` scaled by each contact's mobility the
 norm is an energy, which knows neither frame nor unit; and nothing hangs on how a solution was found.
@@ -41,7 +42,7 @@ _LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)
 _FOUND = 1e-13
 
 
-class _Set(NamedTuple):
+class Allowed(NamedTuple):
     """`Y` above."""
 
     mu: Float[Array, "K B"]
@@ -64,14 +65,26 @@ class _Look(NamedTuple):
 def may_be_redundant(A: Float[Array, "B n n"], contacts: int) -> Bool[Array, " B"]:
     """Whether some of the contacts (`A` of their scales, padding zeros) may be: by the least pivot, diagonals of 1."""
     own = jnp.diagonal(A, axis1=1, axis2=2)
-    size = jnp.where(own > 0, jax.lax.rsqrt(jnp.where(own > 0, own, 1)), 0)
+    size = jnp.where(own > 0, jax.lax.rsqrt(jnp.asarray(jnp.where(own > 0, own, 1))), 0)
     padding = jnp.where(own > 0, 0, 1)[:, None] * jnp.eye(A.shape[1], dtype=A.dtype)
     pivots = jnp.diagonal(jnp.linalg.cholesky(size[:, :, None] * A * size[:, None] + padding), axis1=1, axis2=2)
     several = jnp.sum(own[:, :: A.shape[1] // contacts] > 0, axis=1) > 1
     return several & ~(jnp.min(pivots, axis=1) ** 2 > _REGULAR)
 
 
-def _project(allowed: _Set, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K d B"], Float[Array, "K d d B"]]:
+class Least(NamedTuple):
+    """The impulse `y` of least norm, where one is `found`, and what its derivative needs."""
+
+    y: Float[Array, "K d B"]
+    z: Float[Array, "K d B"]  # y = P(z),
+    w: Float[Array, "K d B"]  # z = (E Q)^T w
+    V: Float[Array, "B n n"]
+    inverse: Float[Array, "B n n"]  # V S^-1 U^T, with columns that are no row of E zero
+    allowed: Allowed
+    found: Bool[Array, " B"]
+
+
+def project(allowed: Allowed, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K d B"], Float[Array, "K d d B"]]:
     """`P(z)` and its derivative."""
     mu, lower, closed, slides, way = allowed
     normal, tangent = z[:, 0], z[:, 1:]
@@ -110,7 +123,7 @@ def least_norm(
     lower: Float[Array, "K B"],
     *,
     lifts: bool = False,
-) -> Float[Array, "K d B"]:
+) -> Least:
     """The impulse of least norm with the modes of the solution `y`, after which velocities are `u`.
 
     All scaled such that the largest velocity is about 1. Where no contacts are redundant, or none is found, it is `y`.
@@ -118,19 +131,18 @@ def least_norm(
     are unique, are kept.
     """
     k, d, batch = y.shape
-    if k == 1:
-        return y
     speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
     still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
     slides = speed > still
     closed = u[:, 0] - (mu * speed if lifts else 0) <= still
     way = -u[:, 1:] / jnp.where(slides, speed, 1)[:, None]
-    allowed = _Set(mu, lower, closed, slides, way)
+    allowed = Allowed(mu, lower, closed, slides, way)
 
     def first(x: Array) -> Array:
         return jnp.moveaxis(x.reshape(k * d, batch), -1, 0)
 
-    held = jnp.broadcast_to((closed & (mu > 0) & (lifts | ~slides))[:, None], y[:, 1:].shape)
+    # What is pushed harder than it needs has friction, too.
+    held = jnp.broadcast_to(((closed | (lower > 0)) & (mu > 0) & (lifts | ~slides))[:, None], y[:, 1:].shape)
     rows = first(jnp.concatenate([closed[:, None], held], axis=1))
     wanted = first(jnp.where(slides[:, None] & lifts, u, 0) - q)
     left, values, right = jnp.linalg.svd(jnp.where(rows[..., None], jnp.moveaxis(Q, -1, 0), 0))
@@ -145,7 +157,7 @@ def least_norm(
 
     def look(a: Array) -> tuple[Array, _Look]:
         z = jnp.einsum("bij,jb->ib", V, a).reshape(k, d, batch)
-        P, D = _project(allowed, z)
+        P, D = project(allowed, z)
         value = jnp.sum(z**2 - (z - P) ** 2, axis=(0, 1)) / 2 - jnp.sum(b * a, axis=0)
         slope = jnp.einsum("bij,ib->jb", V, P.reshape(k * d, batch)) - b
         missed = jnp.where(singular, jnp.max(jnp.abs(slope), axis=0) / size, 0)
@@ -177,4 +189,9 @@ def least_norm(
     unknown = jnp.where(singular, jnp.inf, 0).astype(y.dtype)
     start = _Look(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown)
     end, _ = jax.lax.while_loop(keep_going, body, (start, jnp.asarray(0)))
-    return jnp.where(singular & (end.missed < 1e-9), end.P, y)
+    found = singular & (end.missed < 1e-9)
+    over = counts / jnp.where(counts, values, 1)
+    inverse = jnp.einsum("bij,bj,bkj->bik", V, over, left) * rows[:, None]
+    z = jnp.einsum("bij,jb->ib", V, end.a).reshape(k, d, batch)
+    w = jnp.einsum("bij,jb->ib", left, end.a * over.T).reshape(k, d, batch)
+    return Least(jnp.where(found, end.P, y), z, w, V, inverse, allowed, found)
