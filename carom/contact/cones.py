@@ -246,10 +246,18 @@ def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, fou
     plain = problem.Q - scales.regularization.reshape(k * d, 1, batch) * eye
     Q, q = rows[:, None] * plain * rows, over * problem.q
     u = over * matvec(plain, found.y) + q
-    least = over * least_norm(Q, q, u, ways * found.y, scales.mu, jnp.maximum(problem.lower, 0), lifts=True).y
-    residual = residual_of(problem, least, scales.regularization)
+    least = least_norm(Q, q, u, ways * found.y, scales.mu, jnp.maximum(problem.lower, 0), lifts=True)
+    y = over * least.y
+    residual = residual_of(problem, y, scales.regularization)
     takes = residual <= jnp.maximum(_wanted(settings), found.residual)
-    return found._replace(y=jnp.where(takes, least, found.y), residual=jnp.where(takes, residual, found.residual))
+    chosen = least.found & takes
+    return found._replace(
+        y=jnp.where(takes, y, found.y),
+        residual=jnp.where(takes, residual, found.residual),
+        # It solves the regularised problem around z.
+        regular=jnp.where(chosen, y, found.regular),
+        center=jnp.where(chosen, jnp.where(least.held, over * least.z, y), found.center),
+    )
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------

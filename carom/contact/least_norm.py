@@ -80,6 +80,7 @@ class Least(NamedTuple):
     w: Float[Array, "K d B"]  # z = (E Q)^T w
     V: Float[Array, "B n n"]
     inverse: Float[Array, "B n n"]  # V S^-1 U^T, with columns that are no row of E zero
+    held: Bool[Array, "K d B"]  # rows of E
     allowed: Allowed
     found: Bool[Array, " B"]
 
@@ -190,8 +191,9 @@ def least_norm(
     start = _Look(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown)
     end, _ = jax.lax.while_loop(keep_going, body, (start, jnp.asarray(0)))
     found = singular & (end.missed < 1e-9)
-    over = counts / jnp.where(counts, values, 1)
-    inverse = jnp.einsum("bij,bj,bkj->bik", V, over, left) * rows[:, None]
+    over = jnp.where(counts, 1 / jnp.where(counts, values, 1), 0)
+    inverse = jnp.where(rows[:, None], jnp.einsum("bij,bj,bkj->bik", V, over, left), 0)
     z = jnp.einsum("bij,jb->ib", V, end.a).reshape(k, d, batch)
     w = jnp.einsum("bij,jb->ib", left, end.a * over.T).reshape(k, d, batch)
-    return Least(jnp.where(found, end.P, y), z, w, V, inverse, allowed, found)
+    held = jnp.moveaxis(rows, 0, -1).reshape(k, d, batch)
+    return Least(jnp.where(found, end.P, y), z, w, V, inverse, held, allowed, found)
