@@ -210,6 +210,10 @@ def test_command_learns_from_positions_and_says_the_verdict_first(exact, tmp_pat
     np.savez(tmp_path / "seen.npz", x=world.x, time=world.time)
     (tmp_path / "box.py").write_text(FILE)
     file, data, run = (str(tmp_path / name) for name in ("box.py", "seen.npz", "run"))
+    main(["check", data, "--task", file, "--learn", *LEARN])
+    said = capsys.readouterr().out
+    assert "impacts seen in the motion" in said
+    assert said.index("The learned system explains the data to") < said.index("What the data tell")
     main(["learn", file, "--data", data, "--learn", *LEARN, "--out", run])
     said = capsys.readouterr()
     assert said.out.index("The learned system explains the data to") < said.out.index("What the data tell")

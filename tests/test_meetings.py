@@ -6,7 +6,10 @@ import pytest
 from systems import refused
 
 import carom
+from carom.cli.estimation import is_for_estimator, shows_impacts
 from carom.cli.main import main
+from carom.cli.systems import Chosen
+from carom.learning.config import LearnConfig
 from carom.learning.estimation.inspection import inspect_recording
 from carom.learning.meetings import Meetings, meetings
 
@@ -72,6 +75,10 @@ def test_such_a_recording_is_refused_with_the_reason(tmp_path, monkeypatch, caps
         carom.learn(WALLS, carom.Dataset.split(data), config, progress=False)
     advised = {f.check: f.advice for f in inspect_recording(data, WALLS).findings}
     assert reason in advised["where bodies meet"]
+    carom.save_recording(tmp_path / "data.h5", data)
+    chosen = Chosen("walls.py", WALLS)
+    assert not shows_impacts(tmp_path / "data.h5", WALLS)
+    assert is_for_estimator(tmp_path / "data.h5", LearnConfig.learn, LearnConfig.learn, chosen)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAROM_CACHE", "")
     (tmp_path / "walls.py").write_text(
@@ -81,12 +88,8 @@ def test_such_a_recording_is_refused_with_the_reason(tmp_path, monkeypatch, caps
         "    contacts=[carom.DiskPlane([0], (0.0, 0.0), (1.0, 0.0)),\n"
         "              carom.DiskPlane([0], (1.0, 0.0), (-1.0, 0.0))])\n"
     )
-    carom.save_recording("data.h5", data)
-    main(["check", "data.h5", "--task", "walls.py"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"It cannot be found: the recording cannot tell friction and restitution: {reason}" in said
     with pytest.raises(SystemExit) as stop:
-        main(["learn", "walls.py", "--data", "data.h5", "--out", "run"])
+        main(["learn", "walls.py", "--data", "data.h5", "--out", "run", "--learn", "restitution", "potential"])
     assert stop.value.code == 2
     line = capsys.readouterr().err.strip()
     assert reason in line

@@ -8,7 +8,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from carom.cli.systems import observed_and_system
+from carom.cli.estimation import estimated, estimates_table, names_to_learn, shows_impacts, verdict_first
+from carom.cli.systems import Chosen, observed_and_system
 from carom.cli.tables import findings_table, quantities_table, told_table
 from carom.errors import CaromError
 from carom.learning.estimation.identify import MOST_POINTS, identify
@@ -19,6 +20,9 @@ from carom.recordings.observations import Observations
 from carom.recordings.recording import Recording
 from carom.recordings.recording_checks import Finding, check_recording
 from carom.system import System
+
+ENOUGH = 40
+"""Trajectories of which what they tell is found within a minute."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +42,8 @@ class Check:
     """Leave out what the data can tell, which takes most of the time."""
     quantities: bool = False
     """List everything that can be learned of the system, by the names that it is chosen by."""
+    learn: tuple[str, ...] = ()
+    """Of which quantities to say what the data can tell; by default those that `carom learn` learns by itself."""
 
     def run(self) -> None:
         """Do it."""
@@ -58,14 +64,32 @@ class Check:
             console.print(quantities_table(chosen.system))
         if chosen is None:
             console.print("That shows what they say of the system, too.", highlight=False)
-        elif not self.no_tell and recording is None:
-            console.print(f"What they can tell cannot be found: {why_not}", soft_wrap=True, highlight=False)
-        elif not self.no_tell and recording is not None:
-            self._tell(recording, chosen.system, console)
+        elif not self.no_tell:
+            self._tell(observed, recording, why_not, chosen, console)
         advised = sum(bool(finding.advice) for finding in findings)
         console.print(f"{advised} of {len(findings)} checks have an advice." if advised else "Nothing looks wrong.")
 
-    def _tell(self, recording: Recording, system: System, console: Console) -> None:
+    def _tell(
+        self, observed: Observations, recording: Recording | None, why_not: str, chosen: Chosen, console: Console
+    ) -> None:
+        """What the estimator makes of some trajectories; of recorded states with impacts at samples, `identify`."""
+        system = chosen.system
+        if not self.learn and recording is not None and shows_impacts(self.data, system):
+            self._tell_of_states(recording, system, console)
+        elif self.learn or not system.links:
+            names = self.learn or names_to_learn((), (), chosen)
+            rows = np.unique(np.linspace(0, observed.n_trajectories - 1, ENOUGH).round().astype(int))
+            told = estimated(console, system, observed.take(rows), names)
+            verdict_first(console, told.fit)
+            console.print(estimates_table(told.estimates))
+            if len(rows) < observed.n_trajectories:
+                rest = f"That is of {len(rows)} of {observed.n_trajectories} trajectories; all of them tell more."
+                console.print(rest, highlight=False)
+        else:
+            why = why_not or "impacts happen between the samples"
+            console.print(f"What they can tell is found with --learn NAME ...: {why}", soft_wrap=True, highlight=False)
+
+    def _tell_of_states(self, recording: Recording, system: System, console: Console) -> None:
         """Standard errors of the estimator of `identify`, from the values that the system has."""
         if not system.contacts or system.n_points > MOST_POINTS:
             console.print(

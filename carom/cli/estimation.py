@@ -14,16 +14,19 @@ from rich.table import Table
 from carom.atomic import write_whole
 from carom.cli.outcome import TEST_DATA, pictures, say_unexplained
 from carom.cli.systems import Chosen
+from carom.errors import CaromError
 from carom.learning.estimation.estimate import Told, estimate
 from carom.learning.estimation.verdict import Estimate, Fit
+from carom.learning.meetings import meetings
 from carom.learning.model_file import save_model
 from carom.learning.progress import LoopProgress
 from carom.learning.run import MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.learning.unknowns.models import mass_ratios
-from carom.recordings.files import save_recording
-from carom.recordings.observations import load_observations
+from carom.recordings.files import load_recording, save_recording
+from carom.recordings.observations import Observations, load_observations
 from carom.recordings.recording import Recording
 from carom.simulation.rollout import Trajectory
+from carom.system import System
 
 BY_ITSELF = ("friction", "restitution", "mass", "gravity")
 """What is learned of positions where nothing is said."""
@@ -34,15 +37,27 @@ TRAINED = {"mass", "friction", "restitution", "potential"}
 
 
 def is_for_estimator(data: Path | None, learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> bool:
-    """Whether data are learned from by the estimator: names of other quantities than the trainer's, or no velocities.
+    """Whether data are learned from by the estimator.
 
-    Where velocities are recorded, and nothing is said, the potential is learned too, which takes the trainer.
+    That is so for names of other quantities than the trainer's, and, of bodies without joints, where there are no
+    velocities or impacts happen between the samples. Else, and if nothing is said, the potential is learned too, which
+    takes the trainer.
     """
     if data is None:
         return False
     if set(learn) - TRAINED or (tuple(learn) != tuple(default) and "potential" not in learn):
         return True
-    return not chosen.system.links and load_observations(data).v is None and tuple(learn) == tuple(default)
+    return not chosen.system.links and tuple(learn) == tuple(default) and not shows_impacts(data, chosen.system)
+
+
+def shows_impacts(data: Path, system: System) -> bool:
+    """Whether a file is of states at equal steps, with impacts, if there are any, at the samples."""
+    if load_observations(data).v is None:
+        return False
+    try:
+        return not meetings(load_recording(data), system).not_seen
+    except CaromError:
+        return False
 
 
 def names_to_learn(learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> tuple[str, ...]:
@@ -63,22 +78,9 @@ def learn_by_estimator(
     seed: int,
 ) -> None:
     """Estimate, print and write everything."""
-    with LoopProgress("estimating, %", 100, console=console) as progress:
-        progress.say("reading the data")
-        observations = load_observations(data, chosen.system)
-        held = None if test is None else load_observations(test, chosen.system)
-        progress.say(f"learning {', '.join(learn)} from {observations.n_trajectories} trajectories")
-
-        part = ""
-
-        def say(text: str, share: float) -> None:
-            nonlocal part
-            progress.update(int(100 * share), text)
-            if (now := text.split(":")[0]) != part:
-                part = now
-                progress.say(text)
-
-        told = estimate(chosen.system, observations, learn, test=held, seed=seed, say=say)
+    observations = load_observations(data, chosen.system)
+    held = None if test is None else load_observations(test, chosen.system)
+    told = estimated(console, chosen.system, observations, learn, test=held, seed=seed)
     if chosen.source is not None:
         write_whole(run.path / SYSTEM, chosen.source)
     save_model(run.path / MODEL, told.system, impact=told.fit.impact_rule)
@@ -92,6 +94,30 @@ def learn_by_estimator(
         console.print(f"These data do not tell apart: {', '.join(names)}.", highlight=False)
     pictures(run, told.system, shown, predicted)
     console.print(f"Done ({told.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
+
+
+def estimated(
+    console: Console,
+    system: System,
+    observations: Observations,
+    learn: Sequence[str],
+    *,
+    test: Observations | None = None,
+    seed: int = 0,
+) -> Told:
+    """What observations tell, with a bar while it is found."""
+    with LoopProgress("estimating, %", 100, console=console) as progress:
+        progress.say(f"learning {', '.join(learn)} from {observations.n_trajectories} trajectories")
+        part = ""
+
+        def say(text: str, share: float) -> None:
+            nonlocal part
+            progress.update(int(100 * share), text)
+            if (now := text.split(":")[0]) != part:
+                part = now
+                progress.say(text)
+
+        return estimate(system, observations, learn, test=test, seed=seed, say=say)
 
 
 def report_of(told: Told) -> dict[str, Any]:

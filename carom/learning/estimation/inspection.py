@@ -118,8 +118,10 @@ def _meetings(recording: Recording, system: System) -> list[Finding]:
     found = meetings(recording, system)
     if not sum(found):
         return []
-    steps = found.not_seen and not can_learn_tosses(system)
-    advice = "impacts happen between the samples: friction and restitution cannot be learned" if steps else ""
+    advice = ""
+    if found.not_seen and not can_learn_tosses(system):
+        how = "friction and restitution cannot be learned" if system.links else "the command finds them in the motion"
+        advice = f"impacts happen between the samples: {how}"
     out = [Finding("where bodies meet", str(found), advice)]
     return [*out, _impacts(Observations.of(recording), system)] if found.not_seen else out
 
