@@ -190,8 +190,8 @@ def least_norm(
     start = _Look(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown)
     end, _ = jax.lax.while_loop(keep_going, body, (start, jnp.asarray(0)))
     found = singular & (end.missed < 1e-9)
-    over = counts / jnp.where(counts, values, 1)
-    inverse = jnp.einsum("bij,bj,bkj->bik", V, over, left) * rows[:, None]
+    over = jnp.where(counts, 1 / jnp.where(counts, values, 1), 0)
+    inverse = jnp.where(rows[:, None], jnp.einsum("bij,bj,bkj->bik", V, over, left), 0)
     z = jnp.einsum("bij,jb->ib", V, end.a).reshape(k, d, batch)
     w = jnp.einsum("bij,jb->ib", left, end.a * over.T).reshape(k, d, batch)
     return Least(jnp.where(found, end.P, y), z, w, V, inverse, allowed, found)
