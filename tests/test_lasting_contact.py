@@ -39,7 +39,10 @@ def in_every_size(scene, x0, v0=None, *, dt, steps, points_of_body=1, **options)
         x = in_other_units(x0, length, 1.0, points_of_body)
         v = in_other_units(v0, length / time, 1 / time, points_of_body)
         motion = carom.simulate(system, x, v, dt=dt * time, steps=steps, **options)
-        kinetic = system.kinetic_energy(motion.v) / (mass * length)
+        energy = system.kinetic_energy
+        for _ in motion.v.shape[:-2]:
+            energy = jax.vmap(energy)
+        kinetic = energy(motion.v) / (mass * length)
         x = in_other_units(motion.x, 1 / length, 1.0, points_of_body)
         v = in_other_units(motion.v, time / length, time, points_of_body)
         return x, v, kinetic, motion.residual, motion.overflow
