@@ -12,6 +12,7 @@ from carom.cli.systems import Chosen
 from carom.learning.config import LearnConfig
 from carom.learning.estimation.inspection import inspect_recording
 from carom.learning.meetings import Meetings, meetings
+from carom.recordings.observations import Observations
 
 WALLS = carom.System(
     bodies=[carom.PointMass(1.0, 0.1)],
@@ -77,7 +78,7 @@ def test_such_a_recording_is_refused_with_the_reason(tmp_path, monkeypatch, caps
     assert reason in advised["where bodies meet"]
     carom.save_recording(tmp_path / "data.h5", data)
     chosen = Chosen("walls.py", WALLS)
-    assert not shows_impacts(tmp_path / "data.h5", WALLS)
+    assert not shows_impacts(Observations.of(data), data, WALLS)
     assert is_for_estimator(tmp_path / "data.h5", LearnConfig.learn, LearnConfig.learn, chosen)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CAROM_CACHE", "")

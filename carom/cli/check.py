@@ -8,13 +8,12 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from carom.cli.estimation import estimated, estimates_table, names_to_learn, shows_impacts, verdict_first
+from carom.cli.estimation import estimated, names_to_learn, print_told, recording_in, shows_impacts
 from carom.cli.systems import Chosen, observed_and_system
 from carom.cli.tables import findings_table, quantities_table, told_table
 from carom.errors import CaromError
 from carom.learning.estimation.identify import MOST_POINTS, identify
 from carom.learning.estimation.inspection import inspect_observations, inspect_recording
-from carom.recordings.files import load_recording
 from carom.recordings.observation_checks import check_observations
 from carom.recordings.observations import Observations
 from carom.recordings.recording import Recording
@@ -49,7 +48,7 @@ class Check:
         """Do it."""
         console = Console()
         observed, chosen, word = observed_and_system(self.data, self.task)
-        recording, why_not = _recording(self.data)
+        recording, why_not = recording_in(self.data)
         findings = _findings(observed, recording, None if chosen is None else chosen.system)
         ends = np.nanmax(observed.time, axis=1) - observed.time[:, 0]
         step = float(np.nanmedian(np.diff(observed.time, axis=1)))
@@ -74,14 +73,13 @@ class Check:
     ) -> None:
         """What the estimator makes of some trajectories; of recorded states with impacts at samples, `identify`."""
         system = chosen.system
-        if not self.learn and recording is not None and shows_impacts(self.data, system):
+        if not self.learn and recording is not None and shows_impacts(observed, recording, system):
             self._tell_of_states(recording, system, console)
         elif self.learn or not system.links:
             names = self.learn or names_to_learn((), (), chosen)
             rows = np.unique(np.linspace(0, observed.n_trajectories - 1, ENOUGH).round().astype(int))
             told = estimated(console, system, observed.take(rows), names)
-            verdict_first(console, told.fit)
-            console.print(estimates_table(told.estimates))
+            print_told(console, told)
             if len(rows) < observed.n_trajectories:
                 rest = f"That is of {len(rows)} of {observed.n_trajectories} trajectories; all of them tell more."
                 console.print(rest, highlight=False)
@@ -103,14 +101,6 @@ class Check:
             console.print(f"It cannot be found: {error}", highlight=False)
             return
         console.print(told_table(system, found))
-
-
-def _recording(path: Path) -> tuple[Recording | None, str]:
-    """The recording that a file is, with velocities in equal steps; or None, and why it is none."""
-    try:
-        return load_recording(path), ""
-    except CaromError as error:
-        return None, str(error)
 
 
 def _findings(observed: Observations, recording: Recording | None, system: System | None) -> list[Finding]:

@@ -47,17 +47,23 @@ def is_for_estimator(data: Path | None, learn: Sequence[str], default: Sequence[
         return False
     if set(learn) - TRAINED or (tuple(learn) != tuple(default) and "potential" not in learn):
         return True
-    return not chosen.system.links and tuple(learn) == tuple(default) and not shows_impacts(data, chosen.system)
-
-
-def shows_impacts(data: Path, system: System) -> bool:
-    """Whether a file is of states at equal steps, with impacts, if there are any, at the samples."""
-    if load_observations(data).v is None:
+    if chosen.system.links or tuple(learn) != tuple(default):
         return False
+    observed = load_observations(data)
+    return observed.v is None or not shows_impacts(observed, recording_in(data)[0], chosen.system)
+
+
+def recording_in(path: Path) -> tuple[Recording | None, str]:
+    """The recording that a file is, with velocities in equal steps; or None, and why it is none."""
     try:
-        return not meetings(load_recording(data), system).not_seen
-    except CaromError:
-        return False
+        return load_recording(path), ""
+    except CaromError as error:
+        return None, str(error)
+
+
+def shows_impacts(observed: Observations, recording: Recording | None, system: System) -> bool:
+    """Whether a file is of states at equal steps, with impacts, if there are any, at the samples."""
+    return observed.v is not None and recording is not None and not meetings(recording, system).not_seen
 
 
 def names_to_learn(learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> tuple[str, ...]:
@@ -88,10 +94,7 @@ def learn_by_estimator(
     shown, predicted = shown_motions(told)
     save_recording(run.path / TEST_DATA, shown)
     run.write_json(REPORT, report_of(told))
-    verdict_first(console, told.fit)
-    console.print(estimates_table(told.estimates))
-    for names in told.fit.alike:
-        console.print(f"These data do not tell apart: {', '.join(names)}.", highlight=False)
+    print_told(console, told)
     pictures(run, told.system, shown, predicted)
     console.print(f"Done ({told.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
 
@@ -118,6 +121,14 @@ def estimated(
                 progress.say(text)
 
         return estimate(system, observations, learn, test=test, seed=seed, say=say)
+
+
+def print_told(console: Console, told: Told) -> None:
+    """How well the data are explained, before all else; the quantities; and which cannot be told apart."""
+    verdict_first(console, told.fit)
+    console.print(estimates_table(told.estimates))
+    for names in told.fit.alike:
+        console.print(f"These data do not tell apart: {', '.join(names)}.", highlight=False)
 
 
 def report_of(told: Told) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from carom.contact.batching import FEW
 from carom.contact.cone_algebra import (
+    NEAR_APEX,
     TINY,
     Factored,
     NewtonMatrix,
@@ -67,11 +68,7 @@ class ActiveSet(NamedTuple):
         rhs = add_normal(pull - g, jnp.where(holds, w - _HELD * u, 0))
         scaling = Scaling(direction, jnp.sqrt(curvature[:, : y.shape[1]]))
         margin = jnp.min(jnp.minimum(jnp.min(jnp.maximum(s[:, :2], z[:, :2]), axis=1), jnp.maximum(w, u)), axis=0)
-        return cls(scaling, jnp.where(holds | (apex & (y[:, 0] < _NEAR_APEX)), _HELD, 0), rhs, margin)
-
-
-# An impulse that is nearer to the apex than this is at it, for the derivative.
-_NEAR_APEX = 1e-5
+        return cls(scaling, jnp.where(holds | (apex & (y[:, 0] < NEAR_APEX)), _HELD, 0), rhs, margin)
 
 
 def choose(condition: Array, a: Array, b: Array) -> Array:

@@ -33,6 +33,11 @@ def by_size(used: Int[Array, " B"], contacts: int) -> list[tuple[int, Bool[Array
     return [(size, (used > smaller) & (used <= size)) for smaller, size in zip((0, *sizes[:-1]), sizes, strict=True)]
 
 
+def of_each(flags: Bool[Array, " B"], like: Array) -> Bool[Array, "B ..."]:
+    """Flags of problems, batch first, as they are met with an array `like` (B, ...)."""
+    return flags.reshape(-1, *(1,) * (like.ndim - 1))
+
+
 def solve_chosen(
     solve_block: Callable[..., Any], arrays: tuple[Array, ...], chosen: Bool[Array, " B"], block: int, out: Any
 ) -> Any:
@@ -63,14 +68,11 @@ def solve_chosen(
 def _solve_all(solve_block: Callable[..., Any], arrays: tuple[Array, ...], chosen: Bool[Array, " B"], out: Any) -> Any:
     """`solve_chosen` in one block."""
 
-    def mine(x: Array) -> Array:
-        return chosen.reshape(-1, *(1,) * (x.ndim - 1))
-
     def put(whole: Array, part: Array) -> Array:
         front = tuple(slice(0, size) for size in part.shape)
-        return whole.at[front].set(jnp.where(mine(part), part, whole[front]))
+        return whole.at[front].set(jnp.where(of_each(chosen, part), part, whole[front]))
 
-    return jax.tree.map(put, out, solve_block(*(jnp.where(mine(x), x, jnp.zeros_like(x)) for x in arrays)))
+    return jax.tree.map(put, out, solve_block(*(jnp.where(of_each(chosen, x), x, jnp.zeros_like(x)) for x in arrays)))
 
 
 def as_one_batch(solve: Callable[..., Any], name: str) -> Callable[..., Any]:

@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from carom.contact.linalg import Cholesky, triangle_of
 
 TINY = 1e-30
+NEAR_APEX = 1e-5
+"""An impulse that is nearer to the apex than this, in shares of the scale, is at it, for the derivative."""
 
 
 class ConeSettings(NamedTuple):
@@ -137,6 +139,11 @@ class Scaling(NamedTuple):
 
 def matvec(Q, y):
     return jnp.sum(Q * y.reshape(1, -1, y.shape[-1]), axis=1).reshape(y.shape)
+
+
+def apply(A: Float[Array, "B n n"], x: Float[Array, "B K d"]) -> Float[Array, "B K d"]:
+    """`A x`, batch first."""
+    return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
 
 def pick(stacked: Any, chosen: Int[Array, " B"]) -> Any:

@@ -27,6 +27,7 @@ from carom.contact.cone_algebra import (
     Scales,
     Scaling,
     add_normal,
+    apply,
     matvec,
     residual_of,
     scale,
@@ -325,11 +326,6 @@ def solve_cones(A, v, friction, lower, reference) -> Float[Array, "B K d"]:
 def _friction_scale(x, friction):
     """`S x`: the tangential components times mu."""
     return jnp.concatenate([x[..., :1], x[..., 1:] * friction[..., None]], axis=-1)
-
-
-def apply(A, x):
-    """`A x` for `x` as (B, K, d)."""
-    return jnp.einsum("bij,bj->bi", A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))

@@ -17,20 +17,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
-from carom.contact.cone_algebra import matvec, pick
-from carom.contact.cones import apply, solve_cones
+from carom.contact.cone_algebra import apply, matvec, pick
+from carom.contact.cones import solve_cones
 from carom.contact.coulomb_law import (
     DELTA,
     Judged,
     Modes,
     Problem,
+    Scaled,
     jacobian,
     judge,
     modes_at,
-    scale,
     sensitivity_of,
     softened,
-    sound,
 )
 from carom.contact.least_norm import least_norm, may_be_redundant
 from carom.contact.selection import selected
@@ -178,15 +177,15 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count
     Sweeps, from round 2 on, are twice as many each time.
     """
     count = jnp.max(count, initial=0)
-    finite, (A, v, friction, lower, swept, impulse) = sound(A, v, friction, lower, swept, impulse)
-    problem, size, unit = scale(A, v, friction, lower, reference)
-    whole = size[:, None] * unit
-    swept, start = (jnp.moveaxis(x, 0, -1) / jnp.where(whole > 0, whole, jnp.inf) for x in (swept, impulse))
+    scaled = Scaled.of(A, v, friction, lower, reference)
+    problem, start = scaled.problem, scaled.inside(impulse)
     soft = softened(problem)
     # What is just between two modes (a contact that sticks with all the friction it has, one that only touches) is seen
     # as held, whatever rounding says.
     held = start.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
-    swept = _sweep(soft, jnp.where(count <= 1, held, swept), jnp.where(count > 1, _SWEEPS * 2 ** (count - 1), 0))
+    swept = _sweep(
+        soft, jnp.where(count <= 1, held, scaled.inside(swept)), jnp.where(count > 1, _SWEEPS * 2 ** (count - 1), 0)
+    )
 
     def smaller(state):
         y, delta = state
@@ -198,23 +197,18 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count
     new = _polish(problem, soft, jnp.where(count > 0, y, start), count > 0)
     better = (new.residual < residual) | (count == 0)
     y, worst = (jnp.asarray(jnp.where(better, a, b)) for a, b in ((new.y, start), (new.residual, residual)))
-    nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
-    swept, y = (jnp.moveaxis(x, -1, 0) for x in (swept * whole, y * whole + nan))
-    return _Round(swept, y, jnp.asarray(jnp.where(finite, worst, jnp.inf)))
+    worst = jnp.asarray(jnp.where(scaled.finite, worst, jnp.inf))
+    return _Round(scaled.outside(swept), scaled.outside(y), worst)
 
 
 def _of_least_norm(A, v, friction, lower, reference, impulse, residual) -> CoulombSolution:
     """Of all impulses with the modes of a solution that of least norm, where it obeys the law; batch first."""
-    finite, (A, v, friction, lower, impulse) = sound(A, v, friction, lower, impulse)
-    problem, size, unit = scale(A, v, friction, lower, reference)
-    whole = size[:, None] * unit
-    y = jnp.moveaxis(impulse, 0, -1) / jnp.where(whole > 0, whole, jnp.inf)
+    scaled = Scaled.of(A, v, friction, lower, reference)
+    problem, y = scaled.problem, scaled.inside(impulse)
     least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower).y
     judged = judge(problem, least).residual
-    takes = finite & (judged <= _SOLVED)
-    nan = jnp.asarray(jnp.where(finite, 0, jnp.nan), v.dtype)
-    impulse = jnp.moveaxis(jnp.where(takes, least, y) * whole + nan, -1, 0)
-    return CoulombSolution(impulse, jnp.asarray(jnp.where(takes, judged, residual)))
+    takes = scaled.finite & (judged <= _SOLVED)
+    return CoulombSolution(scaled.outside(jnp.where(takes, least, y)), jnp.asarray(jnp.where(takes, judged, residual)))
 
 
 def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
@@ -227,19 +221,19 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
     start = solve_cones(A, v, friction, lower, reference)
     start = jnp.where(jnp.isfinite(start), start, 0)
 
-    def in_blocks(solve, found, chosen, out, forms, *more):
+    def in_blocks(solve, found, chosen, forms, *more):
         for size, its in forms:
             m = size * d
             arrays = (A[:, :m, :m], *(x[:, :size] for x in (v, friction, lower, reference)))
             arrays += tuple(x[:, :size] if x.ndim > 1 else x for x in (*found, *more))
             block = next((size for most, size in BLOCK.items() if m <= most), 32)
-            out = solve_chosen(solve, arrays, chosen & its, block, out)
-        return out
+            found = solve_chosen(solve, arrays, chosen & its, block, found)
+        return found
 
     def one_round(state):
         count, found = state
         missing = ~(found.residual <= _SOLVED)
-        return count + 1, in_blocks(_one_round, found, missing, found, by_size(used, k), jnp.full(batch, count))
+        return count + 1, in_blocks(_one_round, found, missing, by_size(used, k), jnp.full(batch, count))
 
     def keep_going(state):
         return (state[0] <= _ROUNDS) & jnp.any(~(state[1].residual <= _SOLVED))
@@ -247,7 +241,7 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
     unknown = jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
     _, found = jax.lax.while_loop(keep_going, one_round, (jnp.asarray(0), _Round(start, start, unknown)))
     solution = CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
-    return in_blocks(_of_least_norm, solution, may_be_redundant(A, k), solution, [(k, used > 1)])
+    return in_blocks(_of_least_norm, solution, may_be_redundant(A, k), [(k, used > 0)])
 
 
 _batched = as_one_batch(_solve_batch, "solver of Coulomb's law")

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from carom.contact.cone_algebra import dot, matvec
+from carom.contact.batching import of_each
+from carom.contact.cone_algebra import NEAR_APEX, dot, matvec
 
 DELTA = 1e-9
-_NEAR_APEX = 1e-5
-"""An impulse nearer to zero than this is at it, for the derivative by a bound of zero."""
+"""The diagonal of softened problems, beside A_nn."""
 
 
 class Problem(NamedTuple):
@@ -47,7 +47,7 @@ class Modes(NamedTuple):
 def modes_at(problem: Problem, y: Float[Array, "K d B"], u: Float[Array, "K d B"], apex: Array | bool = False) -> Modes:
     """Modes at `y` with the velocities `u`; contacts in `apex` are held by their bound where `y` is next to zero."""
     trial = y[:, 0] - u[:, 0]
-    closes = (trial > problem.lower) & ~(apex & (y[:, 0] < _NEAR_APEX))
+    closes = (trial > problem.lower) & ~(apex & (y[:, 0] < NEAR_APEX))
     pressed = jnp.where(closes, trial, problem.lower)
     radius = problem.mu * pressed
     push = y[:, 1:] - problem.rho[:, None] * u[:, 1:]
@@ -129,18 +129,39 @@ def judge(problem: Problem, y: Float[Array, "K d B"]) -> Judged:
     return Judged(y, modes, jnp.where(jnp.isfinite(worst), worst, jnp.inf))
 
 
-def sound(A: Array, v: Array, friction: Array, lower: Array, *others: Array) -> tuple[Array, tuple[Array, ...]]:
-    """Which problems have finite data, and all the arrays, batch first, with those of the others zero."""
-    finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction).all(1)
-    finite = finite & (lower < jnp.inf).all(1)
+class Scaled(NamedTuple):
+    """Problems whose data are batch first as a scaled one, batch last; those that are not `finite` as one of zeros."""
 
-    def of(x: Array) -> Array:
-        return jnp.asarray(jnp.where(finite.reshape(-1, *(1,) * (x.ndim - 1)), x, 0))
+    problem: Problem
+    size: Float[Array, "K B"]  # y size unit = f
+    unit: Float[Array, " B"]
+    finite: Bool[Array, " B"]
 
-    return finite, tuple(of(x) for x in (A, v, friction, lower, *others))
+    @classmethod
+    def of(cls, A: Array, v: Array, friction: Array, lower: Array, reference: Array) -> "Scaled":
+        """Each contact by its mobility, the whole by the largest velocity, or that of `reference` (m/s)."""
+        finite = jnp.isfinite(v).all((1, 2)) & jnp.isfinite(A).all((1, 2)) & jnp.isfinite(friction).all(1)
+        finite = finite & (lower < jnp.inf).all(1)
+
+        def sound(x: Array) -> Array:
+            return jnp.asarray(jnp.where(of_each(finite, x), x, 0))
+
+        problem, size, unit = _scale(sound(A), sound(v), sound(friction), sound(lower), reference)
+        return cls(problem, size, unit, finite)
+
+    def inside(self, impulse: Float[Array, "B K d"]) -> Float[Array, "K d B"]:
+        """Impulses (N s) as those of the scaled problem."""
+        whole = self.size[:, None] * self.unit
+        sound = jnp.where(of_each(self.finite, impulse), impulse, 0)
+        return jnp.moveaxis(sound, 0, -1) / jnp.where(whole > 0, whole, jnp.inf)
+
+    def outside(self, y: Float[Array, "K d B"]) -> Float[Array, "B K d"]:
+        """Impulses (N s) of a scaled one; NaN where the data are not finite."""
+        nan = jnp.asarray(jnp.where(self.finite, 0, jnp.nan), y.dtype)
+        return jnp.moveaxis(y * self.size[:, None] * self.unit + nan, -1, 0)
 
 
-def scale(A: Array, v: Array, friction: Array, lower: Array, reference: Array):
+def _scale(A: Array, v: Array, friction: Array, lower: Array, reference: Array):
     """Batch first to a scaled problem, batch last; also what turns its impulses into physical ones, and velocities."""
     batch, k, d = v.shape
     A = jnp.moveaxis(A, 0, -1).reshape(k, d, k, d, batch)
@@ -176,10 +197,9 @@ class Sensitivity(NamedTuple):
 
 def sensitivity_of(A: Array, v: Array, friction: Array, lower: Array, reference: Array, impulse: Array) -> Sensitivity:
     """That of solved problems, batch first in and out; of those whose data are not finite, any."""
-    _, (A, v, friction, bound, impulse) = sound(A, v, friction, lower, impulse)
-    problem, size, unit = scale(A, v, friction, bound, reference)
-    whole = size[:, None] * unit
-    y = jnp.moveaxis(impulse, 0, -1) / jnp.where(whole > 0, whole, jnp.inf)
+    scaled = Scaled.of(A, v, friction, lower, reference)
+    problem, size, unit, _ = scaled
+    y = scaled.inside(impulse)
     k, d, batch = y.shape
     bounded, soft = (lower >= 0).T, softened(problem)
     u = matvec(soft.Q, y) + problem.q

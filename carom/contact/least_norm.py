@@ -115,6 +115,13 @@ def project(allowed: Allowed, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K
     return y, jnp.concatenate([top, jnp.concatenate([lifts[:, :, None], moves], axis=2)], axis=1)
 
 
+def block_diagonal(blocks: Float[Array, "K d d B"]) -> Float[Array, "B n n"]:
+    """One matrix of those of the contacts."""
+    k, d, _, batch = blocks.shape
+    whole = jnp.zeros((k, d, k, d, batch), blocks.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(blocks)
+    return jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
+
+
 def least_norm(
     Q: Float[Array, "n n B"],
     q: Float[Array, "K d B"],
@@ -165,8 +172,7 @@ def least_norm(
         return value, _Look(a, P, D, slope, missed)
 
     def newton(at: _Look) -> Array:
-        whole = jnp.zeros((k, d, k, d, batch), y.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(at.D)
-        whole = jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
+        whole = block_diagonal(at.D)
         curvature = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
         # Flat directions: where all impulses along them are at an edge. The less, the nearer the end.
         ridge = jnp.clip(0.01 * at.missed, 1e-10, 0.01)[:, None]

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from carom.contact.batching import as_one_batch, solve_chosen
-from carom.contact.cone_algebra import matvec
-from carom.contact.least_norm import least_norm, may_be_redundant, project
+from carom.contact.batching import as_one_batch, of_each, solve_chosen
+from carom.contact.cone_algebra import apply, matvec
+from carom.contact.least_norm import block_diagonal, least_norm, may_be_redundant, project
 
 _BLOCK = 32
 _SAME = 1e-6
@@ -28,12 +28,14 @@ _FLAT = 1e-12
 
 
 class Selection(NamedTuple):
-    """What of an impulse the velocities tell, and how the rest follows; batch first, impulses as `f / size`."""
+    """What an impulse's derivative is made of; batch first, impulses as `f / size`.
+
+    Of the solver's derivative, of the velocities' changes without it, and of those of the projection.
+    """
 
     told: Float[Array, "B n n"]
-    met: Float[Array, "B n n"]  # the impulse that undoes changes of velocities, if it is not the solver's
-    turned: Float[Array, "B n n"]  # what is left where the way of sliding follows the impulse
-    of_solver: Bool[Array, "B 1 1"]
+    met: Float[Array, "B n n"]
+    rest: Float[Array, "B n n"]
     by_pull: Float[Array, "B K d d"]  # D
     by_friction: Float[Array, "B K d"]
     by_bound: Float[Array, "B K d"]
@@ -46,8 +48,8 @@ class Selection(NamedTuple):
         """That of problems without redundant contacts."""
         told = jnp.broadcast_to(jnp.eye(k * d, dtype=dtype), (batch, k * d, k * d))
         zeros, square = jnp.zeros((batch, k, d), dtype), jnp.zeros((batch, k, d, d), dtype)
-        own = jnp.ones((batch, 1, 1), bool)
-        return cls(told, 0 * told, told, own, square, zeros, zeros, square[..., 1:], zeros, zeros)
+        none = jnp.zeros_like(told)
+        return cls(told, none, none, square, zeros, zeros, square[..., 1:], zeros, zeros)
 
 
 def _size(A: Float[Array, "B n n"], d: int) -> tuple[Float[Array, "B K 1"], Float[Array, "B K 1"]]:
@@ -82,26 +84,21 @@ def _select(A, v, friction, lower, impulse, *, lifts: bool) -> Selection:
     one, none = jnp.ones_like(allowed.mu), jnp.zeros_like(allowed.mu)
     slip = jnp.sqrt(jnp.sum(u[:, 1:] ** 2, axis=1))
     turns = jnp.where(allowed.slides, -1 / jnp.where(slip > 0, slip, 1), 0)
-    eye = jnp.eye(d - 1, dtype=v.dtype)
-    across = eye[None, :, :, None] - way[:, :, None] * way[:, None]
+    across = jnp.eye(d - 1, dtype=v.dtype)[None, :, :, None] - way[:, :, None] * way[:, None]
     by_slip = jnp.stack([by(none, none, turns[:, None] * across[:, :, t]) for t in range(d - 1)], axis=2)
-    whole = jnp.zeros((k, d, k, d, batch), v.dtype).at[jnp.arange(k), :, jnp.arange(k)].set(D)
-    whole = jnp.moveaxis(whole.reshape(k * d, k * d, batch), -1, 0)
-    V = least.V
+    V, whole, eye = least.V, block_diagonal(D), jnp.eye(k * d, dtype=v.dtype)
     inside = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
-    told = whole @ V @ jnp.linalg.solve(inside + _FLAT * jnp.eye(k * d, dtype=v.dtype), jnp.swapaxes(V, 1, 2))
-    eye = jnp.eye(k * d, dtype=v.dtype)
-    turned = jnp.broadcast_to(eye, told.shape)
+    plane = whole @ V @ jnp.linalg.solve(inside + _FLAT * eye, jnp.swapaxes(V, 1, 2))
+    told, met, rest = (plane, 0 * plane, eye - plane) if lifts else (0 * plane, plane @ least.inverse, eye - plane)
     if d == 3 and not lifts:
-        ways = jnp.zeros((batch, k, d, k, d), v.dtype)
-        ways = ways.at[:, jnp.arange(k), :, jnp.arange(k), 1:].set(unit[:, None, None] * jnp.moveaxis(by_slip, -1, 1))
-        slides = (eye - told) @ ways.reshape(told.shape) @ jnp.moveaxis(Q, -1, 0)
-        turned = jnp.linalg.inv(eye - slides)
+        # The way of sliding follows the impulse.
+        ways = jnp.concatenate([jnp.zeros_like(D[:, :, :1]), unit * by_slip], axis=2)
+        turned = jnp.linalg.inv(eye - rest @ block_diagonal(ways) @ jnp.moveaxis(Q, -1, 0))
+        met, rest = turned @ met, turned @ rest
     found = Selection(
         told,
-        least.inverse,
-        turned,
-        jnp.full((batch, 1, 1), lifts),
+        met,
+        rest,
         *(jnp.moveaxis(part, -1, 0) for part in (D, unit * by(one, none, 0 * way), by(none, one, 0 * way))),
         *(jnp.moveaxis(unit * part, -1, 0) for part in (by_slip, least.z, least.w)),
     )
@@ -110,7 +107,7 @@ def _select(A, v, friction, lower, impulse, *, lifts: bool) -> Selection:
     is_least = least.found & (jnp.max(jnp.abs(unit * least.y - y), axis=(0, 1)) <= _SAME * unit)
 
     def choose(a: Array, b: Array) -> Array:
-        return jnp.where(is_least.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+        return jnp.where(of_each(is_least, a), a, b)
 
     return jax.tree.map(choose, found, Selection.unique(batch, k, d, v.dtype))
 
@@ -149,9 +146,6 @@ def selected(
     out = _batched(lifts)(*data, impulse)
     size, root = _size(A, d)
 
-    def apply(matrix: Array, x: Array) -> Array:
-        return jnp.einsum("bij,bj->bi", matrix, x.reshape(x.shape[0], -1)).reshape(x.shape)
-
     # Scales follow A, too.
     wider = -size * size / 2 * jnp.diagonal(dA, axis1=1, axis2=2)[:, ::d, None]
     y, bound = root * impulse, jnp.where(lower > 0, lower, 0)
@@ -162,5 +156,4 @@ def selected(
     follows = jnp.einsum("bkij,bkj->bki", out.by_pull, pull) + jnp.einsum("bkij,bkj->bki", out.by_slip, slip[..., 1:])
     follows = follows + out.by_friction * dfriction[..., None]
     follows = follows + out.by_bound * (root * dlower[..., None] - root * bound[..., None] * wider)
-    meets = jnp.where(out.of_solver, own, -apply(out.met, speeds))
-    return size * (apply(out.turned, follows + apply(out.told, meets - follows)) + y * wider)
+    return size * (apply(out.told, own) - apply(out.met, speeds) + apply(out.rest, follows) + y * wider)

@@ -46,13 +46,11 @@ def pendulum(friction: float, model: str) -> carom.System:
     )
 
 
-def share(friction: float, model: str) -> tuple[np.ndarray, np.ndarray]:
-    """Energy after the impact over that before, of those that hit; which angles these are."""
-    system, (x, v) = pendulum(friction, model), states()
-    x, v = x[v[:, 1, 1] < 0], v[v[:, 1, 1] < 0]
+def share(system: carom.System, x: jax.Array, v: jax.Array) -> np.ndarray:
+    """Energy after the impact over that before."""
     after = carom.simulate(system, x, v, dt=1e-6, steps=1, throw=False).v[:, -1]
     energy = jax.vmap(system.kinetic_energy)
-    return np.degrees(ANGLES[np.asarray(states()[1][:, 1, 1] < 0)]), np.asarray(energy(after) / energy(v))
+    return np.asarray(energy(after) / energy(v))
 
 
 def draw(path: str | Path) -> Path:
@@ -61,6 +59,7 @@ def draw(path: str | Path) -> Path:
         figure = new_figure(9.6, 3.2)
         picture, *panels = figure.subplots(1, 3, width_ratios=[1, 1.4, 1.4])
         x, v = states()
+        hits = np.asarray(v[:, 1, 1] < 0)
         (shown,) = np.flatnonzero(np.isclose(ANGLES, np.radians(-45.5)))[:1]
         links = np.concatenate([np.zeros((1, 2)), np.asarray(x[shown])])
         picture.plot(*links.T, "-o", color=INK, markersize=6)
@@ -73,7 +72,12 @@ def draw(path: str | Path) -> Path:
         for axes, friction in zip(panels, (0.0, 0.6), strict=True):
             axes.axhline(1, color=MUTED, linewidth=0.8)
             for model, (label, color) in MODELS.items():
-                axes.plot(*share(friction, model), color=color, label=label)
+                axes.plot(
+                    np.degrees(ANGLES[hits]),
+                    share(pendulum(friction, model), x[hits], v[hits]),
+                    color=color,
+                    label=label,
+                )
             axes.set(
                 title=f"mu = {friction:g}, e = {RESTITUTION:g}",
                 xlabel="angle of the first link (deg)",
