@@ -31,7 +31,7 @@ from carom.contact.coulomb_law import (
     sensitivity_of,
     softened,
 )
-from carom.contact.least_norm import least_norm, may_be_redundant
+from carom.contact.least_norm import are_redundant, least_norm
 from carom.contact.selection import selected
 
 # --- The method -------------------------------------------------------------------------------------------------
@@ -56,14 +56,16 @@ _SOLVED = 1e-10
 """Residual at which a problem counts as solved; that of a problem in single precision is larger by the ratio of eps."""
 _CONVERGED = 1e-12
 """Newton steps go on until no |H| is larger."""
-_SWEEPS = 24
+_SWEEPS = (0, 0, 48, 96, 192)
+"""Sweeps of the rounds (those that follow: as many as the last): most problems take the first two, without any."""
 _STEPS = 10
 _ROUNDS = 8
-"""Rounds of sweeps and steps, each with twice the sweeps of the last; most problems take the first, without any."""
 _LENGTHS = (1.0, 0.5, 0.2, 0.05)
 """Shares of a Newton step that are tried."""
-BLOCK = {6: 128, 24: 64}
-"""Problems solved together, by the most rows that one has (more rows: 32)."""
+LEAST_NORM_STEPS = (8, 80)
+"""Steps toward the impulse of least norm: most problems need no more than the first."""
+BLOCK = {6: 64}
+"""Problems solved together, by the most rows that one has (more rows: 16): the slowest of them holds up the others."""
 
 
 class CoulombSolution(NamedTuple):
@@ -173,8 +175,7 @@ class _Round(NamedTuple):
 def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count) -> _Round:
     """Sweeps and Newton steps for one block of problems, batch first in and out; round 0 looks at the start.
 
-    Odd rounds take Newton steps at once; even ones come down from a large diagonal, with which there is one solution.
-    Sweeps, from round 2 on, are twice as many each time.
+    Odd rounds come down from a large diagonal, with which there is one solution; the others take Newton steps at once.
     """
     count = jnp.max(count, initial=0)
     scaled = Scaled.of(A, v, friction, lower, reference)
@@ -184,7 +185,9 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count
     # as held, whatever rounding says.
     held = start.at[:, 0].multiply(1 + 1e-4).at[:, 0].add(1e-6)
     swept = _sweep(
-        soft, jnp.where(count <= 1, held, scaled.inside(swept)), jnp.where(count > 1, _SWEEPS * 2 ** (count - 1), 0)
+        soft,
+        jnp.where(count <= 1, held, scaled.inside(swept)),
+        jnp.asarray(_SWEEPS)[jnp.minimum(count, len(_SWEEPS) - 1)],
     )
 
     def smaller(state):
@@ -201,14 +204,24 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count
     return _Round(scaled.outside(swept), scaled.outside(y), worst)
 
 
-def _of_least_norm(A, v, friction, lower, reference, impulse, residual) -> CoulombSolution:
+class _Choice(NamedTuple):
+    """Impulses (N s), how far they miss the law, and which of them are those of least norm; batch first."""
+
+    impulse: Float[Array, "B K d"]
+    residual: Float[Array, " B"]
+    least: Bool[Array, " B"]
+
+
+def _of_least_norm(A, v, friction, lower, reference, impulse, residual, _, steps) -> _Choice:
     """Of all impulses with the modes of a solution that of least norm, where it obeys the law; batch first."""
     scaled = Scaled.of(A, v, friction, lower, reference)
     problem, y = scaled.problem, scaled.inside(impulse)
-    least = least_norm(problem.Q, problem.q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower).y
-    judged = judge(problem, least).residual
+    u, most = matvec(problem.Q, y) + problem.q, jnp.max(steps, initial=0)
+    least = least_norm(problem.Q, problem.q, u, y, problem.mu, problem.lower, steps=most)
+    judged = judge(problem, least.y).residual
     takes = scaled.finite & (judged <= _SOLVED)
-    return CoulombSolution(scaled.outside(jnp.where(takes, least, y)), jnp.asarray(jnp.where(takes, judged, residual)))
+    residual = jnp.asarray(jnp.where(takes, judged, residual))
+    return _Choice(scaled.outside(jnp.where(takes, least.y, y)), residual, least.found | ~least.singular)
 
 
 def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
@@ -226,7 +239,7 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
             m = size * d
             arrays = (A[:, :m, :m], *(x[:, :size] for x in (v, friction, lower, reference)))
             arrays += tuple(x[:, :size] if x.ndim > 1 else x for x in (*found, *more))
-            block = next((size for most, size in BLOCK.items() if m <= most), 32)
+            block = next((size for most, size in BLOCK.items() if m <= most), 16)
             found = solve_chosen(solve, arrays, chosen & its, block, found)
         return found
 
@@ -240,8 +253,16 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
 
     unknown = jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
     _, found = jax.lax.while_loop(keep_going, one_round, (jnp.asarray(0), _Round(start, start, unknown)))
-    solution = CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
-    return in_blocks(_of_least_norm, solution, may_be_redundant(A, k), [(k, used > 0)])
+    found = CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
+    scaled = Scaled.of(A, v, friction, lower, reference)
+    problem, y = scaled.problem, scaled.inside(found.impulse)
+    redundant = are_redundant(problem.Q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
+
+    def choose(go, choice: _Choice) -> _Choice:
+        steps = jnp.asarray(LEAST_NORM_STEPS)[go]
+        return in_blocks(_of_least_norm, choice, ~choice.least, by_size(used, k), jnp.full(batch, steps))
+
+    return CoulombSolution(*jax.lax.fori_loop(0, len(LEAST_NORM_STEPS), choose, _Choice(*found, ~redundant))[:2])
 
 
 _batched = as_one_batch(_solve_batch, "solver of Coulomb's law")

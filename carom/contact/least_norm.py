@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.cone_algebra import dot, pick
 
@@ -38,6 +38,8 @@ _REGULAR = 1e-6
 _STILL = 1e-7
 """Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
 _STEPS = 80
+_PATIENCE = 12
+"""Steps without a better one after which a search has failed: modes that nothing can have, or rounding."""
 _LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)
 _FOUND = 1e-13
 
@@ -62,14 +64,49 @@ class _Look(NamedTuple):
     missed: Float[Array, " B"]  # by it, where that matters
 
 
+class _Search(NamedTuple):
+    """Where the search is, the best that it has seen, and when that was."""
+
+    at: _Look
+    best: _Look
+    since: Int[Array, " B"]
+    step: Int[Array, ""]
+
+
 def may_be_redundant(A: Float[Array, "B n n"], contacts: int) -> Bool[Array, " B"]:
     """Whether some of the contacts (`A` of their scales, padding zeros) may be: by the least pivot, diagonals of 1."""
     own = jnp.diagonal(A, axis1=1, axis2=2)
     size = jnp.where(own > 0, jax.lax.rsqrt(jnp.asarray(jnp.where(own > 0, own, 1))), 0)
     padding = jnp.where(own > 0, 0, 1)[:, None] * jnp.eye(A.shape[1], dtype=A.dtype)
     pivots = jnp.diagonal(jnp.linalg.cholesky(size[:, :, None] * A * size[:, None] + padding), axis1=1, axis2=2)
-    several = jnp.sum(own[:, :: A.shape[1] // contacts] > 0, axis=1) > 1
+    several = jnp.sum(jnp.any(own.reshape(len(own), contacts, -1) > 0, axis=2), axis=1) > 1
     return several & ~(jnp.min(pivots, axis=1) ** 2 > _REGULAR)
+
+
+def are_redundant(
+    Q: Float[Array, "n n B"],
+    u: Float[Array, "K d B"],
+    y: Float[Array, "K d B"],
+    mu: Float[Array, "K B"],
+    lower: Float[Array, "K B"],
+) -> Bool[Array, " B"]:
+    """Whether those contacts may be that act with the modes of a solution (see `least_norm`), which alone matter."""
+    rows = jnp.moveaxis(_held(u, y, mu, lower, lifts=False)[1].reshape(len(Q), -1), -1, 0)
+    acting = jnp.where(rows[:, :, None] & rows[:, None], jnp.moveaxis(Q, -1, 0), 0)
+    return may_be_redundant(acting, len(u))
+
+
+def _held(u: Array, y: Array, mu: Array, lower: Array, *, lifts: bool) -> tuple[Allowed, Bool[Array, "K d B"]]:
+    """`Y`, and the rows of the plane, with the modes of the solution `y`."""
+    speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
+    still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
+    slides = speed > still
+    closed = u[:, 0] - (mu * speed if lifts else 0) <= still
+    way = -u[:, 1:] / jnp.where(slides, speed, 1)[:, None]
+    # What is pushed harder than it needs has friction, too.
+    tangents = ((closed | (lower > 0)) & (mu > 0) & (lifts | ~slides))[:, None]
+    rows = jnp.concatenate([closed[:, None], jnp.broadcast_to(tangents, y[:, 1:].shape)], axis=1)
+    return Allowed(mu, lower, closed, slides, way), rows
 
 
 class Least(NamedTuple):
@@ -82,6 +119,7 @@ class Least(NamedTuple):
     inverse: Float[Array, "B n n"]  # V S^-1 U^T, with columns that are no row of E zero
     held: Bool[Array, "K d B"]  # rows of E
     allowed: Allowed
+    singular: Bool[Array, " B"]  # contacts are redundant
     found: Bool[Array, " B"]
 
 
@@ -131,27 +169,22 @@ def least_norm(
     lower: Float[Array, "K B"],
     *,
     lifts: bool = False,
+    steps: int | Int[Array, ""] = _STEPS,
 ) -> Least:
     """The impulse of least norm with the modes of the solution `y`, after which velocities are `u`.
 
     All scaled such that the largest velocity is about 1. Where no contacts are redundant, or none is found, it is `y`.
     `lifts`: of the convex programs, where a contact that slides leaves with `u_n = mu |u_t|`; these velocities, which
-    are unique, are kept.
+    are unique, are kept. Of those that `steps` are too few for none is found.
     """
     k, d, batch = y.shape
-    speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
-    still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
-    slides = speed > still
-    closed = u[:, 0] - (mu * speed if lifts else 0) <= still
-    way = -u[:, 1:] / jnp.where(slides, speed, 1)[:, None]
-    allowed = Allowed(mu, lower, closed, slides, way)
+    allowed, held = _held(u, y, mu, lower, lifts=lifts)
+    slides = allowed.slides
 
     def first(x: Array) -> Array:
         return jnp.moveaxis(x.reshape(k * d, batch), -1, 0)
 
-    # What is pushed harder than it needs has friction, too.
-    held = jnp.broadcast_to(((closed | (lower > 0)) & (mu > 0) & (lifts | ~slides))[:, None], y[:, 1:].shape)
-    rows = first(jnp.concatenate([closed[:, None], held], axis=1))
+    rows = first(held)
     wanted = first(jnp.where(slides[:, None] & lifts, u, 0) - q)
     left, values, right = jnp.linalg.svd(jnp.where(rows[..., None], jnp.moveaxis(Q, -1, 0), 0))
     counts = values > _SINGULAR * values[:, :1]
@@ -179,27 +212,30 @@ def least_norm(
         curvature = curvature + jnp.where(counts, ridge, 1)[..., None] * eye
         return -jnp.linalg.solve(curvature, at.slope.T[..., None])[..., 0].T
 
-    def keep_going(state):
-        at, step = state
-        return (step <= _STEPS) & jnp.any(at.missed > _FOUND)
+    def keep_going(search: _Search):
+        going = (search.best.missed > _FOUND) & (search.step - search.since <= _PATIENCE)
+        return (search.step <= steps) & jnp.any(going)
 
-    def body(state):
-        at, step = state
+    def body(search: _Search) -> _Search:
+        at, best, step = search.at, search.best, search.step
         # The first time there is no step, only a look at the start. All is computed for each length, and so written
         # once: to compile it costs more than to run it.
         change = jax.lax.cond(step > 0, newton, lambda at: jnp.zeros_like(at.a), at)
         values, looks = jax.vmap(lambda length: look(at.a + length * change))(lengths)
         chosen = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0)
         # Near the end values differ by rounding alone.
-        return pick(looks, jnp.where(at.missed < 1e-6, 0, chosen)), step + 1
+        new = pick(looks, jnp.where(at.missed < 1e-6, 0, chosen))
+        since = jnp.where(new.missed < 0.9 * best.missed, step, search.since)
+        better = new.missed < best.missed
+        return _Search(new, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best), since, step + 1)
 
     unknown = jnp.where(singular, jnp.inf, 0).astype(y.dtype)
     start = _Look(b, y, jnp.zeros((k, d, d, batch), y.dtype), b, unknown)
-    end, _ = jax.lax.while_loop(keep_going, body, (start, jnp.asarray(0)))
+    none = jnp.asarray(0)
+    end = jax.lax.while_loop(keep_going, body, _Search(start, start, jnp.zeros(batch, none.dtype), none)).best
     found = singular & (end.missed < 1e-9)
     over = jnp.where(counts, 1 / jnp.where(counts, values, 1), 0)
     inverse = jnp.where(rows[:, None], jnp.einsum("bij,bj,bkj->bik", V, over, left), 0)
     z = jnp.einsum("bij,jb->ib", V, end.a).reshape(k, d, batch)
     w = jnp.einsum("bij,jb->ib", left, end.a * over.T).reshape(k, d, batch)
-    held = jnp.moveaxis(rows, 0, -1).reshape(k, d, batch)
-    return Least(jnp.where(found, end.P, y), z, w, V, inverse, held, allowed, found)
+    return Least(jnp.where(found, end.P, y), z, w, V, inverse, held, allowed, singular, found)
