@@ -21,8 +21,6 @@ from carom.simulation.impact import ImpactRule, Stepper
 from carom.simulation.projection import project_state
 from carom.simulation.rollout import step
 
-EVENTS = 4
-"""Most impacts within a step."""
 FREE, NEAR = 256, 64
 """Windows that are moved together, without and with contact."""
 PLACES = 4
@@ -57,7 +55,7 @@ def _moved(learned: Learned, theta, z, dt, rule: ImpactRule, contact: bool):
 
     def one(z, theta):
         system = learned.assemble(theta)
-        stepper = Stepper(dt=dt, impact=rule, events=EVENTS, project=bool(system.links), contact=contact)
+        stepper = Stepper(dt=dt, impact=rule, project=bool(system.links), contact=contact)
         out = step(system, z[0], z[1], stepper)
         return jnp.stack([out.x, out.v])
 
