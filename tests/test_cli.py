@@ -102,7 +102,6 @@ def killed(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 @pytest.mark.timeout(500)
 def test_a_killed_training_goes_on_where_it_was(killed):
     assert [m["epoch"] for m in RunFolder(killed.folder).metrics()] == list(range(1, EPOCHS + 1))

@@ -154,7 +154,6 @@ def test_one_sliding_contact_by_hand():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_fast_impacts_have_less_friction_and_restitution():
     e, mu, speed, losses, pace = 0.8, 0.3, 0.4, (0.3, 0.5), 0.25
     lost = 1 - np.exp(-speed / pace)

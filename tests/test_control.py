@@ -54,7 +54,6 @@ def test_throw_hit_in_finer_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_ground_then_wall():
     _, _, report = solved("ground-wall")
     assert report.miss < 1e-3
@@ -97,7 +96,6 @@ def test_with_learned_properties_on_the_true_system(problem):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 @pytest.mark.parametrize("optimizer", ["adam", "lbfgs"])
 def test_a_run_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch, optimizer):
     monkeypatch.setattr(control_module, "CHECKPOINT_EVERY", 2)

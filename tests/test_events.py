@@ -224,7 +224,6 @@ def test_bounce_once():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_two_balls():
     """Task 4 of the same: derivatives of its loss by the start, from the analytic solution (to the 6 digits given)."""
     task, system = find_task("two-balls"), carom.task("two-balls")

@@ -210,7 +210,6 @@ for _ in range(int(sys.argv[2])):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_killed_while_it_saves_checkpoints(tmp_path):
     """The last checkpoint that was finished is always there, and every kill comes after more of them."""
     kills = 12

@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+IN_BUDGET = ("2-learning", "5-contact")
 LINK = re.compile(r"\[[^\]]*\]\((?!https?:)([^)\s#]+)\)")
 
 
@@ -73,8 +74,11 @@ def test_each_has_a_place_in_the_table_of_contents():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "notebook",
+    [pytest.param(path, marks=[pytest.mark.ci_budget] if path.stem in IN_BUDGET else []) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_runs(notebook, tmp_path):
     cache = jax.config.jax_compilation_cache_dir
     environment = {**os.environ, "CAROM_SMALL": "1", "MPLBACKEND": "Agg"}

@@ -120,7 +120,6 @@ def test_elastic_impacts_keep_energy(task):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_constraints_hold_after_ten_thousand_steps():
     system = carom.task("cp3")
     x0, v0 = carom.sample(system, jax.random.key(2), 1)
