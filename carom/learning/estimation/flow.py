@@ -21,7 +21,7 @@ from carom.simulation.impact import ImpactRule, Stepper
 from carom.simulation.projection import project_state
 from carom.simulation.rollout import step
 
-FREE, NEAR = 256, 64
+FREE, NEAR = 64, 32
 """Windows that are moved together, without and with contact."""
 PLACES = 4
 """Places on the way of a step at which gaps are looked at, before it is said that none can close."""
