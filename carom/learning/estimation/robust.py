@@ -102,7 +102,7 @@ _LOST = 1e-14
 """Curvature below this share of the largest, times the number of parameters, is lost in rounding."""
 
 
-def _spectrum(H, prior):
+def spectrum(H, prior):
     """Directions (columns, not of unit length) in which `H + prior` is diagonal, its curvatures, and where H is lost.
 
     There the prior decides alone: rounding of data that are almost exact is greater than all that it says.
@@ -124,7 +124,7 @@ def newton_step(H, g, prior, pull, change, lower, upper):
     for _ in range(5):
         fixed = np.where(held, np.clip(target, lower, upper) - change, 0)
         free = ~held
-        directions, curvature, lost = _spectrum(H[np.ix_(free, free)], prior[np.ix_(free, free)])
+        directions, curvature, lost = spectrum(H[np.ix_(free, free)], prior[np.ix_(free, free)])
         told, asked = ((slope + matrix @ fixed)[free] for slope, matrix in ((g, H), (pull, prior)))
         delta = fixed.copy()
         delta[free] = -directions @ ((np.where(lost, 0, told @ directions) + asked @ directions) / curvature)
@@ -142,7 +142,7 @@ def _standard_errors(blocks: Blocks, u, distance, size, prior):
     q = u.shape[1]
     weight = _redescending(distance)
     bread = np.maximum(weight - 4 * distance / (CUTOFF * q) * (1 + distance / CUTOFF) ** -3, 0) / size
-    directions, curvature, lost = _spectrum(_normal_equations(blocks, bread, u)[0], prior)
+    directions, curvature, lost = spectrum(_normal_equations(blocks, bread, u)[0], prior)
     inverse, told = ((directions / part) @ directions.T for part in (curvature, np.where(lost, np.inf, curvature)))
     influence = np.einsum("nqp,nq->np", blocks.jacobian, u * (weight / size)[:, None]) @ told
     clusters, index = np.unique(blocks.cluster, return_inverse=True)

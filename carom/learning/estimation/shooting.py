@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from carom.learning.estimation.flow import Flow, Motion
-from carom.learning.estimation.robust import CUTOFF, newton_step
+from carom.learning.estimation.robust import CUTOFF, newton_step, spectrum
 from carom.learning.estimation.windows import Windows
 
 Loss = Literal["convex", "redescending", "squares"]
@@ -191,7 +191,8 @@ def shoot(
         if not held and len(g):
             ends = np.maximum(lower - state.theta, -MOST * scale), np.minimum(upper - state.theta, MOST * scale)
             change = newton_step(H, g, prior, change, change, *ends)
-        error = np.sqrt(np.diag(np.linalg.pinv(H + prior)) * size)
+        directions, curvature, _ = spectrum(H, prior)
+        error = np.sqrt(np.sum(directions**2 / curvature, axis=1) * size)
         still = bool(np.all(np.abs(change) < SETTLED * error))
         for share in 0.25 ** np.arange(4):
             move = -(share * reduced.own + reduced.follow @ (share * change))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
+from carom.learning.estimation.robust import spectrum
 from carom.learning.estimation.shooting import LOST, Shooting, State, shoot
 from carom.simulation.impact import ImpactRule
 
@@ -124,7 +125,8 @@ def spread(shooting: Shooting, state: State, clusters: Int[np.ndarray, " W"], sh
     total, free = _sums(shooting, state)
     left = total[rows].sum() / max(free[rows].sum() - len(H), 1.0)
     prior = np.diag(scale**-2.0) * 1e-6
-    inverse = np.linalg.inv(H + prior)
+    directions, curvature, _ = spectrum(H, prior)
+    inverse = (directions / curvature) @ directions.T
     influence = reduced.gradient[rows] @ inverse
     _, index = np.unique(clusters[rows], return_inverse=True)
     count = int(index.max(initial=0)) + 1
@@ -136,10 +138,10 @@ def spread(shooting: Shooting, state: State, clusters: Int[np.ndarray, " W"], sh
     ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(model), 1))
     covariance = model * ratio[:, None] * ratio[None]
     told = covariance / np.outer(scale, scale)
-    sizes, directions = np.linalg.eigh(told)
+    sizes, ways = np.linalg.eigh(told)
     alike = [
-        [learned.names[k] for k in np.flatnonzero(np.abs(direction) > 0.2)]
-        for size, direction in zip(sizes, directions.T, strict=True)
+        [learned.names[k] for k in np.flatnonzero(np.abs(way) > 0.2)]
+        for size, way in zip(sizes, ways.T, strict=True)
         if size > TIED**2
     ]
     return Spread(covariance, max(count - 1, 1), [names for names in alike if len(names) > 1], at_bound)
