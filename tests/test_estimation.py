@@ -150,8 +150,11 @@ def test_exact_positions_give_the_truth(exact):
     for one in exact.estimates:
         # Floats of positions, 1e-16 m, are multiplied by some hundred through each of a few impacts.
         assert abs(one.value - true[one.name]) < 1e-9
-        assert one.verdict == "identified"
+        # Of fewer than ten impacts that tell nothing is called told, however sharp.
+        told = one.impacts is None or one.impacts >= 10
+        assert one.verdict == ("identified" if told else "not identified")
         assert one.lower <= true[one.name] <= one.upper
+    assert sum(one.verdict == "identified" for one in exact.estimates) >= len(true) - 1
 
 
 @pytest.mark.slow

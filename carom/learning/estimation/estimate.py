@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from carom.checks import require
@@ -46,6 +46,8 @@ REDESCENDING: tuple[Loss, ...] = ("redescending",)
 SHORT: tuple[Loss, ...] = (*CONVEX * 3, *REDESCENDING * 3)
 LONG: tuple[Loss, ...] = (*CONVEX, *REDESCENDING * 3)
 LAST: tuple[Loss, ...] = ("squares",) * 3
+FEW = 150
+"""Windows that the first steps are taken with, while quantities are far off: more of them do not make these better."""
 AT_SAMPLES = 0.05
 """Kinks that are within so much of a step of a sample are at it."""
 
@@ -186,17 +188,21 @@ def _by_rule(
         a, b = (begin + share * (end - begin) for share in (a, b))
         return work.of(f"{text} (impacts by the rule {rule!r})", a, b, steps)
 
-    shooting = shooting_of(short)
+    few = _few(short, held)
+    shooting = shooting_of(short.take(few))
     require(bool(shooting.used.any()), "the observations have no window with free motion to learn from.")
     work.say(f"compiling, for a minute or two (impacts by the rule {rule!r})", begin)
-    state = shoot(shooting, theta, short.start, SHORT, each=part(0.0, 0.6, "windows of an impact each", len(SHORT)))
+    each = part(0.0, 0.4, "windows of an impact each", len(SHORT))
+    state = shoot(shooting, theta, shooting.windows.start, SHORT, each=each)
     state = _begun_again(shooting, state, shooting_of)
+    starts = short.start.copy()
+    starts[few] = state.z
     longer = windows_of(found, None)
     wide = shooting_of(longer)
-    each = part(0.6, 0.8, "longer windows", len(LONG))
-    there = shoot(wide, state.theta, _starts(short, state, longer), LONG, each=each)
+    each = part(0.4, 0.8, "longer windows", len(LONG))
+    there = shoot(wide, state.theta, _starts(short, starts, longer), LONG, each=each)
     there = _begun_again(wide, there, shooting_of)
-    windows, z = _those_that_fit(wide, there, short, state)
+    windows, z = _those_that_fit(wide, there, short, starts, shooting_of)
     shooting = shooting_of(windows)
     state = shooting.at(there.theta, z)
     shooting.keep_what_fits(state)
@@ -221,23 +227,39 @@ def _begun_again(shooting: Shooting, state: State, shooting_of: Callable[[Window
     return shooting.at(state.theta, z)
 
 
-def _starts(short: Windows, state: State, longer: Windows) -> Float[np.ndarray, "W 2 n d"]:
-    """Starts of longer windows: as they were fitted to the first of their short ones."""
+def _few(short: Windows, held: Bool[np.ndarray, " N"]) -> Int[np.ndarray, " F"]:
+    """Windows to take the first steps with, from all the motion: of an impact each while there are enough of these."""
+    rows = np.flatnonzero(~held[short.trajectory])
+    hit = rows[short.kink[rows].any(axis=1)]
+    chosen = hit if len(hit) >= FEW else rows
+    return chosen[np.unique(np.linspace(0, len(chosen) - 1, min(FEW, len(chosen))).round().astype(int))]
+
+
+def _starts(short: Windows, z: Float[np.ndarray, "W 2 n d"], longer: Windows) -> Float[np.ndarray, "V 2 n d"]:
+    """Starts of longer windows: those of the first of their short ones."""
     where = {key: k for k, key in enumerate(zip(short.trajectory.tolist(), short.first.tolist(), strict=True))}
     keys = zip(longer.trajectory.tolist(), longer.first.tolist(), strict=True)
     index = np.array([where.get(key, -1) for key in keys])
-    return np.where((index >= 0)[:, None, None, None], state.z[index], longer.start)
+    return np.where((index >= 0)[:, None, None, None], z[index], longer.start)
 
 
 def _those_that_fit(
-    wide: Shooting, there: State, short: Windows, state: State
+    wide: Shooting,
+    there: State,
+    short: Windows,
+    starts: Float[np.ndarray, "V 2 n d"],
+    shooting_of: Callable[[Windows], Shooting],
 ) -> tuple[Windows, Float[np.ndarray, "W 2 n d"]]:
-    """Long windows that fit; in place of the others, the short ones of their trajectories."""
+    """Long windows that fit; in place of the others, the short ones of their trajectories, fitted from `starts`."""
     wide.keep_what_fits(there)
-    rest = np.flatnonzero(np.isin(short.trajectory, wide.windows.trajectory[~wide.fits]))
     fit = np.flatnonzero(wide.fits)
-    windows = Windows.concatenate([wide.windows.take(fit), short.take(rest)])
-    return windows, np.concatenate([there.z[fit], state.z[rest]])
+    rest = np.flatnonzero(np.isin(short.trajectory, wide.windows.trajectory[~wide.fits]))
+    windows, z = [wide.windows.take(fit)], [there.z[fit]]
+    if len(rest):
+        part = shooting_of(short.take(rest))
+        windows.append(part.windows)
+        z.append(shoot(part, there.theta, starts[rest], ("redescending",) * 4, held=True).z)
+    return Windows.concatenate(windows), np.concatenate(z)
 
 
 def _told(shooting: Shooting, state: State, found: Survey, held: Bool[np.ndarray, " N"], rule: ImpactRule) -> Told:

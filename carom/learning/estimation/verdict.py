@@ -186,12 +186,13 @@ def estimates_of(shooting: Shooting, state: State, found: Spread, *, explained: 
     out = []
     for j, name in enumerate(learned.names):
         free = learned.quantities[j].label.kind not in CONTACTS
-        enough = free or tells[j] >= LEAST_IMPACTS
-        verdict: Verdict = "identified" if enough and error[j] <= TOLD * scale[j] else "not identified"
+        enough, sharp = free or tells[j] >= LEAST_IMPACTS, bool(error[j] <= TOLD * scale[j])
+        verdict: Verdict = "identified" if enough and sharp else "not identified"
         size = abs(beyond[j] - values[j]) / 1e-3 if not found.at_bound[j] else (upper[j] - lower[j]) / width
         low, high = float(min(lower[j], upper[j])), float(max(lower[j], upper[j]))
         kind = learned.quantities[j].label.kind
-        if explained and verdict == "not identified" and without[j] >= LEAST_IMPACTS:
+        # Where a few impacts tell, their interval says more than a bound.
+        if explained and not sharp and without[j] >= LEAST_IMPACTS:
             bound = _bound(shooting, state, j, -1.0 if kind == "friction" else 1.0)
             if bound is not None and kind == "friction":
                 verdict, low, high = "bounded below", bound, np.inf
