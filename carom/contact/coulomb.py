@@ -53,7 +53,7 @@ from carom.contact.selection import selected
 # least norm is taken (`least_norm.py`): a diagonal alone selects it only to rounding over `delta`.
 
 _SOLVED = 1e-10
-"""Residual at which a problem counts as solved; that of a problem in single precision is larger by the ratio of eps."""
+"""Residual at which a problem counts as solved."""
 _CONVERGED = 1e-12
 """Newton steps go on until no |H| is larger."""
 _SWEEPS = (0, 0, 48, 96, 192)
@@ -175,7 +175,8 @@ class _Round(NamedTuple):
 def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count) -> _Round:
     """Sweeps and Newton steps for one block of problems, batch first in and out; round 0 looks at the start.
 
-    Odd rounds come down from a large diagonal, with which there is one solution; the others take Newton steps at once.
+    Odd rounds from 3 on come down from a large diagonal, with which there is one solution; the others take Newton steps
+    at once.
     """
     count = jnp.max(count, initial=0)
     scaled = Scaled.of(A, v, friction, lower, reference)

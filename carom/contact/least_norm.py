@@ -39,7 +39,7 @@ _STILL = 1e-7
 """Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
 _STEPS = 80
 _PATIENCE = 12
-"""Steps without a better one after which a search has failed: modes that nothing can have, or rounding."""
+"""Steps without one that is better by a tenth after which a search ends: modes that nothing can have, or rounding."""
 _LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)
 _FOUND = 1e-13
 
@@ -74,13 +74,18 @@ class _Search(NamedTuple):
 
 
 def may_be_redundant(A: Float[Array, "B n n"], contacts: int) -> Bool[Array, " B"]:
-    """Whether some of the contacts (`A` of their scales, padding zeros) may be: by the least pivot, diagonals of 1."""
+    """Whether some of several contacts (`A` of their scales, padding zeros) may be."""
+    own = jnp.diagonal(A, axis1=1, axis2=2)[:, :: A.shape[1] // contacts]
+    return (jnp.sum(own > 0, axis=1) > 1) & _is_singular(A)
+
+
+def _is_singular(A: Float[Array, "B n n"]) -> Bool[Array, " B"]:
+    """By the least pivot, diagonals of 1; rows of zeros are none."""
     own = jnp.diagonal(A, axis1=1, axis2=2)
     size = jnp.where(own > 0, jax.lax.rsqrt(jnp.asarray(jnp.where(own > 0, own, 1))), 0)
     padding = jnp.where(own > 0, 0, 1)[:, None] * jnp.eye(A.shape[1], dtype=A.dtype)
     pivots = jnp.diagonal(jnp.linalg.cholesky(size[:, :, None] * A * size[:, None] + padding), axis1=1, axis2=2)
-    several = jnp.sum(jnp.any(own.reshape(len(own), contacts, -1) > 0, axis=2), axis=1) > 1
-    return several & ~(jnp.min(pivots, axis=1) ** 2 > _REGULAR)
+    return ~(jnp.min(pivots, axis=1) ** 2 > _REGULAR)
 
 
 def are_redundant(
@@ -93,7 +98,7 @@ def are_redundant(
     """Whether those contacts may be that act with the modes of a solution (see `least_norm`), which alone matter."""
     rows = jnp.moveaxis(_held(u, y, mu, lower, lifts=False)[1].reshape(len(Q), -1), -1, 0)
     acting = jnp.where(rows[:, :, None] & rows[:, None], jnp.moveaxis(Q, -1, 0), 0)
-    return may_be_redundant(acting, len(u))
+    return _is_singular(acting)
 
 
 def _held(u: Array, y: Array, mu: Array, lower: Array, *, lifts: bool) -> tuple[Allowed, Bool[Array, "K d B"]]:

@@ -228,11 +228,10 @@ def _begun_again(shooting: Shooting, state: State, shooting_of: Callable[[Window
 
 
 def _few(short: Windows, held: Bool[np.ndarray, " N"]) -> Int[np.ndarray, " F"]:
-    """Windows to take the first steps with, from all the motion: of an impact each while there are enough of these."""
-    rows = np.flatnonzero(~held[short.trajectory])
-    hit = rows[short.kink[rows].any(axis=1)]
-    chosen = hit if len(hit) >= FEW else rows
-    return chosen[np.unique(np.linspace(0, len(chosen) - 1, min(FEW, len(chosen))).round().astype(int))]
+    """Windows to take the first steps with, from all the motion: first of all those with an impact."""
+    rows = np.random.default_rng(0).permutation(np.flatnonzero(~held[short.trajectory]))
+    hit = short.kink[rows].any(axis=1)
+    return np.sort(np.concatenate([rows[hit], rows[~hit]])[:FEW])
 
 
 def _starts(short: Windows, z: Float[np.ndarray, "W 2 n d"], longer: Windows) -> Float[np.ndarray, "V 2 n d"]:
@@ -253,12 +252,12 @@ def _those_that_fit(
     """Long windows that fit; in place of the others, the short ones of their trajectories, fitted from `starts`."""
     wide.keep_what_fits(there)
     fit = np.flatnonzero(wide.fits)
-    rest = np.flatnonzero(np.isin(short.trajectory, wide.windows.trajectory[~wide.fits]))
+    rest = np.flatnonzero(~np.isin(short.trajectory, wide.windows.trajectory[fit]))
     windows, z = [wide.windows.take(fit)], [there.z[fit]]
     if len(rest):
         part = shooting_of(short.take(rest))
         windows.append(part.windows)
-        z.append(shoot(part, there.theta, starts[rest], ("redescending",) * 4, held=True).z)
+        z.append(shoot(part, there.theta, starts[rest], (*CONVEX, *REDESCENDING * 4), held=True).z)
     return Windows.concatenate(windows), np.concatenate(z)
 
 
@@ -266,7 +265,8 @@ def _told(shooting: Shooting, state: State, found: Survey, held: Bool[np.ndarray
     learned, points = shooting.flow.learned, len(found.noise)
     share = noise_share(shooting, state)
     of = spread(shooting, state, shooting.windows.trajectory, share)
-    rows = held[shooting.windows.trajectory] if held.any() else shooting.used
+    rows = held[shooting.windows.trajectory]
+    rows = rows if rows.any() else shooting.used
     kept = shooting.kept
     shooting.kept = shooting.numbers > 0
     well = how_well(shooting, state, share, points, rows)

@@ -79,7 +79,7 @@ class Shooting:
     def keep_what_fits(self, state: State) -> None:
         """Leave out, of plain sums of squares, windows that do not fit, and single samples that are far off."""
         each = self.of_windows(state)
-        typical = max(float(np.median(each[self.used])), self.least)
+        typical = max(float(np.median(each[self.used] if self.used.any() else each)), self.least)
         self.fits = each <= LOST * typical
         near = self.distance(state) <= OUTLIER**2 * typical
         self.kept = (self.numbers > 0) & self.fits[:, None] & near

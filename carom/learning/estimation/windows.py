@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from carom.checks import require
 from carom.recordings.clock import STEP_TOLERANCE, digit_of
 from carom.recordings.observations import Observations
 
@@ -298,6 +299,7 @@ def windows_of(found: Survey, impacts: int | None) -> Windows:
             window = _window(found, track, number, first, last)
             if window is not None:
                 parts.append(window)
+    require(bool(parts), f"the observations have no {2 * ROOM} samples in a row between impacts to learn from.")
     return Windows.concatenate(parts)
 
 
