@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from carom.checks import as_floats, at_once_if_known, is_share, not_negative, require, require_values
-from carom.contact.candidates import Active, Candidates, Contact, active_set, all_candidates
+from carom.contact.candidates import Active, Candidates, Contact, active_set, traced_candidates
 from carom.contact.impulses import ContactModel, contact_model_of
 from carom.mechanics.bodies import (
     Body,
@@ -263,7 +263,8 @@ class System(eqx.Module):
 
     def candidates(self, x: Float[Array, "n d"]) -> Candidates:
         """Gaps (m) and Jacobians of all contacts that could be."""
-        return all_candidates(self.contacts, x, self.radii, self.table)
+        gap, stencil, rows = traced_candidates(self.contacts, x, self.radii, self.table)
+        return Candidates(gap, np.array(stencil), rows)
 
     def active(self, x: Float[Array, "n d"], closed: Bool[Array, " C"] | None = None) -> Active:
         """The closed contacts at `x`, deepest first, padded to `max_active`; `closed`: if not by their gaps, which."""

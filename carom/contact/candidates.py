@@ -269,6 +269,13 @@ def all_candidates(
     )
 
 
+@eqx.filter_jit
+def traced_candidates(contacts, x, radii, table) -> tuple[Float[Array, " C"], tuple, Float[Array, "C d P d"]]:
+    """`all_candidates`, traced once for each system: a step asks for them dozens of times."""
+    gap, stencil, rows = all_candidates(contacts, x, radii, table)
+    return gap, tuple(map(tuple, stencil.tolist())), rows
+
+
 class Active(NamedTuple):
     """The candidates that enter the solver, deepest first, padded to a fixed number with `active` false.
 

@@ -80,6 +80,8 @@ def smooth_flow(system: System, stepper: Stepper, inverse_mass: Float[Array, "n 
     """
     field = FIELDS[stepper.formulation]
 
+    # Each is traced once: a step calls them a dozen times, within loops that are transformed several times.
+    @jax.jit
     def rate(state, pressing=None):
         x, v = state
         total = -jax.grad(system.potential_energy)(x)
@@ -89,6 +91,7 @@ def smooth_flow(system: System, stepper: Stepper, inverse_mass: Float[Array, "n 
             total = total + contact_force(system, x, pressing)
         return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
 
+    @jax.jit
     def after(state, time, pressing=None):
         x, v = flow(stepper.solver, lambda state: rate(state, pressing), state, time)
         return project_state(system.constraints, x, v, inverse_mass) if stepper.project else (x, v)

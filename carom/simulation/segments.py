@@ -169,15 +169,16 @@ class _Stepping:
             residual=now.residual,
         )
 
-        # Both ends are one program, run twice: most of it is the solver.
+        # Both ends are one program, run twice: most of it is the solver. What is jitted is traced once: the loops around
+        # it are each transformed several times, and all that is within them anew.
         def end_of(state: _Segment, first: Bool[Array, ""]):
             state, change = jax.lax.cond(
                 first,
-                lambda: self.touching(state, now.left),
+                jax.jit(lambda: self.touching(state, now.left)),
                 lambda: (state, jnp.zeros_like(state.pressing)),
             )
-            state, held = self.act(state, change, first, count)
-            return jax.lax.cond(first, lambda: self.move(state, held, now, count), lambda: state), None
+            state, held = jax.jit(lambda: self.act(state, change, first, count))()
+            return jax.lax.cond(first, jax.jit(lambda: self.move(state, held, now, count)), lambda: state), None
 
         end, _ = jax.lax.scan(end_of, start, jnp.array([True, False]))
         return _Progress(
