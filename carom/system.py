@@ -263,8 +263,7 @@ class System(eqx.Module):
 
     def candidates(self, x: Float[Array, "n d"]) -> Candidates:
         """Gaps (m) and Jacobians of all contacts that could be."""
-        gap, stencil, rows = traced_candidates(self.contacts, x, self.radii, self.table)
-        return Candidates(gap, np.array(stencil), rows)
+        return traced_candidates(self.contacts, x, self.radii, self.table)
 
     def active(self, x: Float[Array, "n d"], closed: Bool[Array, " C"] | None = None) -> Active:
         """The closed contacts at `x`, deepest first, padded to `max_active`; `closed`: if not by their gaps, which."""

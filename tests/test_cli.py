@@ -132,7 +132,12 @@ def test_learn_writes_a_whole_run_folder(killed):
     config = json.loads((learned / "config.json").read_text())
     assert (config["task"], config["epochs"], config["model"]) == ("throw", EPOCHS, "clnn")
     report = json.loads((learned / "report.json").read_text())
-    assert set(report) == {"learned", "evaluation", "identification"}
+    assert set(report) == {"estimates", "fit", "learned", "evaluation", "identification"}
+    assert report["fit"]["impact_rule"] == "step"
+    shown = {one["name"]: one for one in report["estimates"]}
+    told = report["identification"]
+    assert set(shown) == {f"{kind}:{k}" for kind in ("friction", "restitution") for k in range(len(told[kind]))}
+    assert shown["friction:0"]["value"] == told["friction"][0]["value"]
     with Image.open(learned / "prediction.gif") as animation:
         assert animation.n_frames > 20
     assert carom.load_model(learned / "model.carom").friction.tolist() == report["learned"]["friction"]

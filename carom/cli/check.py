@@ -48,7 +48,7 @@ class Check:
         """Do it."""
         console = Console()
         observed, chosen, word = observed_and_system(self.data, self.task)
-        recording, why_not = recording_in(self.data)
+        recording = recording_in(self.data)
         findings = _findings(observed, recording, None if chosen is None else chosen.system)
         ends = np.nanmax(observed.time, axis=1) - observed.time[:, 0]
         step = float(np.nanmedian(np.diff(observed.time, axis=1)))
@@ -64,35 +64,31 @@ class Check:
         if chosen is None:
             console.print("That shows what they say of the system, too.", highlight=False)
         elif not self.no_tell:
-            self._tell(observed, recording, why_not, chosen, console)
+            self._tell(observed, recording, chosen, console)
         advised = sum(bool(finding.advice) for finding in findings)
         console.print(f"{advised} of {len(findings)} checks have an advice." if advised else "Nothing looks wrong.")
 
-    def _tell(
-        self, observed: Observations, recording: Recording | None, why_not: str, chosen: Chosen, console: Console
-    ) -> None:
+    def _tell(self, observed: Observations, recording: Recording | None, chosen: Chosen, console: Console) -> None:
         """What the estimator makes of some trajectories; of recorded states with impacts at samples, `identify`."""
         system = chosen.system
+        if not self.learn and system.n_points > MOST_POINTS:
+            console.print(f"What data can tell is found for up to {MOST_POINTS} points.", highlight=False)
+            return
         if not self.learn and recording is not None and shows_impacts(observed, recording, system):
             self._tell_of_states(recording, system, console)
-        elif self.learn or not system.links:
-            names = self.learn or names_to_learn((), (), chosen)
-            rows = np.unique(np.linspace(0, observed.n_trajectories - 1, ENOUGH).round().astype(int))
-            told = estimated(console, system, observed.take(rows), names)
-            print_told(console, told)
-            if len(rows) < observed.n_trajectories:
-                rest = f"That is of {len(rows)} of {observed.n_trajectories} trajectories; all of them tell more."
-                console.print(rest, highlight=False)
-        else:
-            why = why_not or "impacts happen between the samples"
-            console.print(f"What they can tell is found with --learn NAME ...: {why}", soft_wrap=True, highlight=False)
+            return
+        names = self.learn or names_to_learn((), (), chosen)
+        rows = np.unique(np.linspace(0, observed.n_trajectories - 1, ENOUGH).round().astype(int))
+        told = estimated(console, system, observed.take(rows), names)
+        print_told(console, told)
+        if len(rows) < observed.n_trajectories:
+            rest = f"That is of {len(rows)} of {observed.n_trajectories} trajectories; all of them tell more."
+            console.print(rest, highlight=False)
 
     def _tell_of_states(self, recording: Recording, system: System, console: Console) -> None:
         """Standard errors of the estimator of `identify`, from the values that the system has."""
-        if not system.contacts or system.n_points > MOST_POINTS:
-            console.print(
-                f"What data can tell is found with contacts, and up to {MOST_POINTS} points.", highlight=False
-            )
+        if not system.contacts:
+            console.print("What data can tell is found with contacts.", highlight=False)
             return
         console.print("Finding what the data can tell, with the potential as it is given ...", highlight=False)
         try:

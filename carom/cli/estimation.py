@@ -16,12 +16,14 @@ from carom.cli.outcome import TEST_DATA, pictures, say_unexplained
 from carom.cli.systems import Chosen
 from carom.errors import CaromError
 from carom.learning.estimation.estimate import Told, estimate
+from carom.learning.estimation.refine import MOST_POINTS
 from carom.learning.estimation.verdict import Estimate, Fit
 from carom.learning.meetings import meetings
 from carom.learning.model_file import save_model
 from carom.learning.progress import LoopProgress
 from carom.learning.run import MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.learning.unknowns.models import mass_ratios
+from carom.learning.unknowns.quantities import describe, matches
 from carom.recordings.files import load_recording, save_recording
 from carom.recordings.observations import Observations, load_observations
 from carom.recordings.recording import Recording
@@ -39,26 +41,26 @@ TRAINED = {"mass", "friction", "restitution", "potential"}
 def is_for_estimator(data: Path | None, learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> bool:
     """Whether data are learned from by the estimator.
 
-    That is so for names of other quantities than the trainer's, and, of bodies without joints, where there are no
-    velocities or impacts happen between the samples. Else, and if nothing is said, the potential is learned too, which
-    takes the trainer.
+    That is so for names of other quantities than the trainer's, and where there are no velocities or impacts happen
+    between the samples. Else, and if nothing is said, the potential is learned too, which takes the trainer.
     """
     if data is None:
         return False
     if set(learn) - TRAINED or (tuple(learn) != tuple(default) and "potential" not in learn):
         return True
-    if chosen.system.links or tuple(learn) != tuple(default):
+    system = chosen.system
+    if tuple(learn) != tuple(default) or (system.links and (not system.contacts or system.n_points > MOST_POINTS)):
         return False
     observed = load_observations(data)
-    return observed.v is None or not shows_impacts(observed, recording_in(data)[0], chosen.system)
+    return observed.v is None or not shows_impacts(observed, recording_in(data), system)
 
 
-def recording_in(path: Path) -> tuple[Recording | None, str]:
-    """The recording that a file is, with velocities in equal steps; or None, and why it is none."""
+def recording_in(path: Path) -> Recording | None:
+    """The recording that a file is, with velocities in equal steps, if it is one."""
     try:
-        return load_recording(path), ""
-    except CaromError as error:
-        return None, str(error)
+        return load_recording(path)
+    except CaromError:
+        return None
 
 
 def shows_impacts(observed: Observations, recording: Recording | None, system: System) -> bool:
@@ -67,11 +69,11 @@ def shows_impacts(observed: Observations, recording: Recording | None, system: S
 
 
 def names_to_learn(learn: Sequence[str], default: Sequence[str], chosen: Chosen) -> tuple[str, ...]:
-    """What is asked for; by itself, all that a system with free bodies has."""
+    """What is asked for; by itself, what the system has of `BY_ITSELF`."""
     if tuple(learn) != tuple(default):
         return tuple(learn)
-    one = len(chosen.system.bodies) == 1
-    return tuple(name for name in BY_ITSELF if not (one and name == "mass"))
+    names = [name for name, *_ in describe(chosen.system)]
+    return tuple(kind for kind in BY_ITSELF if any(matches(kind, name) for name in names))
 
 
 def learn_by_estimator(

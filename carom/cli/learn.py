@@ -17,7 +17,7 @@ from carom.atomic import write_whole
 from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
 from carom.cli.estimation import is_for_estimator, learn_by_estimator, names_to_learn
-from carom.cli.outcome import TEST_DATA, pictures, warn_if_far_off, what_is_told
+from carom.cli.outcome import TEST_DATA, estimates_and_fit, pictures, warn_if_far_off, what_is_told
 from carom.cli.systems import Chosen, choose, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import learn_and_measure
@@ -301,6 +301,7 @@ class Learn:
         run.write_json(
             REPORT,
             {
+                **estimates_and_fit(system, found, measures),
                 "learned": dataclasses.asdict(report),
                 "evaluation": measures,
                 "identification": found and dataclasses.asdict(found),

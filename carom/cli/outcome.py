@@ -15,6 +15,7 @@ from carom.learning.evaluate import far_off, state_errors
 from carom.learning.run import TRUTH, RunFolder
 from carom.learning.training.train import quantities
 from carom.learning.unknowns.baselines import BASELINES
+from carom.learning.unknowns.quantities import describe
 from carom.recordings.recording import Recording
 from carom.simulation.rollout import Trajectory
 from carom.system import System
@@ -48,6 +49,40 @@ def what_is_told(
     except CaromError as error:  # what was learned is to be kept and measured all the same
         console.print(f"It cannot be found: {error}", highlight=False)
         return None
+
+
+def estimates_and_fit(system: System, found: Identification | None, measures: dict[str, Any]) -> dict[str, Any]:
+    """What was found as the estimator reports it: `estimates` by the names of quantities, and the `fit`.
+
+    What was trained on recorded states is not measured in units of their noise (`chi2` is None), but by predictions:
+    where these are far off, no quantity is told.
+    """
+    explained = not far_off(measures)
+    fit = {"explained": explained, "chi2": None, "by_channel": {}, "impact_rule": "step"}
+    if found is None:
+        return {"estimates": [], "fit": fit}
+    of = {name: (what, unit) for name, what, _, unit in describe(system)}
+    parts = {f"mass:{k}": one for k, one in enumerate(found.mass_ratio, 1)}
+    for kind in ("friction", "restitution"):
+        parts |= {f"{kind}:{k}": one for k, one in enumerate(getattr(found, kind))}
+    return {
+        "estimates": [
+            {
+                "name": name,
+                "of": of[name][0],
+                "value": one.value,
+                "standard_error": one.standard_error,
+                "lower": one.lower,
+                "upper": one.upper,
+                "unit": of[name][1],
+                "verdict": one.verdict if explained else "misfit",
+                "impacts": one.impacts,
+            }
+            for name, one in parts.items()
+            if name in of  # a property that no contact has is no quantity
+        ],
+        "fit": fit,
+    }
 
 
 def warn_if_far_off(console: Console, measures: dict[str, Any]) -> None:

@@ -269,11 +269,22 @@ def all_candidates(
     )
 
 
+class _Stencil(eqx.Module):
+    points: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+
 @eqx.filter_jit
-def traced_candidates(contacts, x, radii, table) -> tuple[Float[Array, " C"], tuple, Float[Array, "C d P d"]]:
-    """`all_candidates`, traced once for each system: a step asks for them dozens of times."""
+def _traced(contacts, x, radii, table):
     gap, stencil, rows = all_candidates(contacts, x, radii, table)
-    return gap, tuple(map(tuple, stencil.tolist())), rows
+    return gap, _Stencil(tuple(map(tuple, stencil.tolist()))), rows
+
+
+def traced_candidates(
+    contacts: Sequence[Contact], x: Float[Array, "n d"], radii: Float[Array, " bodies"], table: BodyTable
+) -> Candidates:
+    """`all_candidates`, traced once for each system: a step asks for them dozens of times."""
+    gap, stencil, rows = _traced(contacts, x, radii, table)
+    return Candidates(gap, np.array(stencil.points), rows)
 
 
 class Active(NamedTuple):

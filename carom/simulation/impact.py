@@ -1,5 +1,6 @@
 """How contacts change the velocity at one time, and what says how to step."""
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import diffrax
@@ -73,15 +74,15 @@ class StepResult(eqx.Module):
     residual: Float[Array, ""]
 
 
-def smooth_flow(system: System, stepper: Stepper, inverse_mass: Float[Array, "n n"], force=None):
+def smooth_flow(
+    system: System, stepper: Stepper, inverse_mass: Float[Array, "n n"], force=None
+) -> tuple[Callable, Callable]:
     """The motion between impacts, as two functions of a state `(x, v)`: its rate, and the state after a time (s).
 
     Both take the forces of contacts that last, if any: (C, d) in N, in the frame of each candidate (normal first).
     """
     field = FIELDS[stepper.formulation]
 
-    # Each is traced once: a step calls them a dozen times, within loops that are transformed several times.
-    @jax.jit
     def rate(state, pressing=None):
         x, v = state
         total = -jax.grad(system.potential_energy)(x)
@@ -91,12 +92,14 @@ def smooth_flow(system: System, stepper: Stepper, inverse_mass: Float[Array, "n 
             total = total + contact_force(system, x, pressing)
         return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
 
-    @jax.jit
+    # Each is traced once: a step calls them a dozen times, within loops that are transformed several times.
+    once = jax.jit(rate)
+
     def after(state, time, pressing=None):
-        x, v = flow(stepper.solver, lambda state: rate(state, pressing), state, time)
+        x, v = flow(stepper.solver, lambda state: once(state, pressing), state, time)
         return project_state(system.constraints, x, v, inverse_mass) if stepper.project else (x, v)
 
-    return rate, after
+    return once, jax.jit(after)
 
 
 def contact_force(system: System, x: Float[Array, "n d"], pressing: Float[Array, "C d"]) -> Float[Array, "n d"]:

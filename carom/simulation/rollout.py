@@ -64,7 +64,8 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
         x, v = after((x, v), stepper.dt)
         return StepResult(x, v, jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
     if stepper.impact == "step" and (system.compensation == "paper" or not has_impulses(system, x, v, stepper)):
-        return impact_at(system, *after((x, v), stepper.dt), inverse_mass, stepper)
+        x, v = after((x, v), stepper.dt)
+        return impact_at(system, x, v, inverse_mass, stepper)
     return step_in_segments(system, x, v, inverse_mass, stepper, (rate, after))
 
 

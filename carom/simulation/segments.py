@@ -47,8 +47,8 @@ _AT_REST = 0.6
 """A body rests if it moves by less than this power of the machine's precision, of what its acceleration alone would."""
 
 
-class _Progress(NamedTuple):
-    """How far a step has come."""
+class Progress(NamedTuple):
+    """How far a step has come. Only `x`, `v` and `left` have derivatives."""
 
     x: Float[Array, "n d"]
     v: Float[Array, "n d"]
@@ -58,6 +58,13 @@ class _Progress(NamedTuple):
     overflow: Int[Array, ""]
     residual: Float[Array, ""]
     push: Float[Array, " n"]  # m/s^2, of the points without contact, at the start of the step
+
+    @classmethod
+    def begin(cls, system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], dt: Float[Array, ""]) -> "Progress":
+        """At the start of a step."""
+        no, zero = jnp.asarray(False), jnp.zeros((), x.dtype)
+        none = jnp.zeros(system.n_candidates, bool)
+        return cls(x, v, dt, none, no, jnp.asarray(0), zero, jnp.zeros_like(x[:, 0]))
 
 
 class _Segment(NamedTuple):
@@ -86,14 +93,12 @@ def step_in_segments(
     motion: tuple[Callable, Callable],
 ) -> StepResult:
     """One step with contact; `motion` is that of `smooth_flow`."""
-    no, zero = jnp.asarray(False), jnp.zeros((), x.dtype)
-    none = jnp.zeros(system.n_candidates, bool)
-    start = _Progress(x, v, stepper.dt, none, no, jnp.asarray(0), zero, jnp.zeros_like(x[:, 0]))
-    segment = _Stepping(system, inverse_mass, stepper, motion)
+    start = Progress.begin(system, x, v, stepper.dt)
+    segment = Segments(system, inverse_mass, stepper, motion)
     if stepper.impact == "step":
-        return _result(system, start, segment(start, jnp.asarray(0)))
+        return end_of_step(system, start, segment(start, jnp.asarray(0)))
 
-    def part(now: _Progress, count):
+    def part(now: Progress, count):
         goes_on = now.left > 0
 
         def go_on():
@@ -106,19 +111,20 @@ def step_in_segments(
         # What a segment computes is computed again for the derivative: kept, it would be that of all segments that a
         # step may have, of which most have one.
         end, _ = jax.lax.scan(jax.checkpoint(part), start, jnp.arange(stepper.events + 1))
-        return _result(system, start, end)
+        return end_of_step(system, start, end)
 
     _, after = motion
     end = after((x, v), stepper.dt)
     near = may_close(segment.still, *jax.lax.stop_gradient(((x, v), end)), stepper.dt)
 
     def alone():
-        return StepResult(end[0], end[1], no, jnp.asarray(0), zero)
+        return StepResult(end[0], end[1], start.contact, start.overflow, start.residual)
 
     return jax.lax.cond(anywhere(near), with_contact, alone)
 
 
-def _result(system: System, start: _Progress, end: _Progress) -> StepResult:
+def end_of_step(system: System, start: Progress, end: Progress) -> StepResult:
+    """The step from its start and the end of its last segment."""
     # Rounding moves what rests, and an unstable equilibrium multiplies it. A body that has moved by no more stays where
     # it was, without a velocity; derivatives are those of the motion.
     body = _body_of_point(system)
@@ -139,8 +145,8 @@ def _size(vectors: Float[Array, "n d"]) -> Float[Array, " n"]:
     return jnp.max(jnp.abs(jax.lax.stop_gradient(vectors)), axis=1)
 
 
-class _Stepping:
-    """One segment of a step: what does not change from one to the next."""
+class Segments:
+    """What moves a step on by a segment: by the rule of events, to the next event or to its end."""
 
     def __init__(self, system: System, inverse_mass, stepper: Stepper, motion: tuple[Callable, Callable]):
         self.system, self.inverse_mass, self.stepper = system, inverse_mass, stepper
@@ -148,8 +154,8 @@ class _Stepping:
         # Nothing in the search for events is differentiated, the system's own geometry included.
         self.still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
 
-    def __call__(self, now: _Progress, count: Int[Array, ""]) -> _Progress:
-        """From `now` to the next event, or to the end of the step."""
+    def __call__(self, now: Progress, count: Int[Array, ""]) -> Progress:
+        """From `now` to the next event, or to the end of the step; `count` segments have been before."""
         zero = jnp.zeros_like(now.left)
         forces = jnp.zeros((self.system.n_candidates, self.system.dim), now.x.dtype)
         none = jnp.zeros_like(now.acted)
@@ -169,8 +175,8 @@ class _Stepping:
             residual=now.residual,
         )
 
-        # Both ends are one program, run twice: most of it is the solver. What is jitted is traced once: the loops around
-        # it are each transformed several times, and all that is within them anew.
+        # Both ends are one program, run twice: most of it is the solver. What is jitted is traced once: the loops
+        # around it are each transformed several times, and all that is within them anew.
         def end_of(state: _Segment, first: Bool[Array, ""]):
             state, change = jax.lax.cond(
                 first,
@@ -181,7 +187,7 @@ class _Stepping:
             return jax.lax.cond(first, jax.jit(lambda: self.move(state, held, now, count)), lambda: state), None
 
         end, _ = jax.lax.scan(end_of, start, jnp.array([True, False]))
-        return _Progress(
+        return Progress(
             x=end.x,
             v=end.v,
             left=jnp.where(end.again, now.left - end.time, 0),
@@ -308,7 +314,7 @@ class _Stepping:
         x = x + jnp.einsum("kid,k->id", contacts.response[::d], push)
         return project_state(self.system.constraints, x, v, self.inverse_mass) if stepper.project else (x, v)
 
-    def move(self, state: _Segment, impulse: Float[Array, "C d"], now: _Progress, count: Int[Array, ""]) -> _Segment:
+    def move(self, state: _Segment, impulse: Float[Array, "C d"], now: Progress, count: Int[Array, ""]) -> _Segment:
         """From the start of a segment, where contacts that last want an `impulse` (N s), to its other end."""
         left = now.left
         pressing = impulse / jnp.where(left > 0, left, 1)

@@ -1,11 +1,12 @@
-"""Motions of many windows and their derivatives, by two small programs: a step in which nothing can touch, and one.
+"""Motions of many windows and their derivatives, by two programs: a step in which nothing can touch, and a part of one.
 
 Each window goes on in its own time. Its next step is tried without contact first, all windows at once; those in which
-a gap may close wait until there are enough of them for a step with contact. So impacts cost what they cost, wherever
-they are, and windows of any length share the programs. Derivatives by the start of a window and by the quantities are
-composed from those of single steps, in forward mode.
+a gap may close wait until there are enough of them to go on with contact, from one impact to the next (a segment). So
+impacts cost what they cost, wherever they are, and windows of any length share the programs. Derivatives by the start
+of a window and by the quantities are composed from those of single steps and segments, in forward mode.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,13 +14,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from carom.learning.unknowns.quantities import Learned
 from carom.simulation.events import closing_speed, hermite, touching
-from carom.simulation.impact import ImpactRule, Stepper
+from carom.simulation.impact import ImpactRule, Stepper, smooth_flow
 from carom.simulation.projection import project_state
 from carom.simulation.rollout import step
+from carom.simulation.segments import Progress, Segments, end_of_step
+from carom.system import System
 
 FREE, NEAR = 64, 32
 """Windows that are moved together, without and with contact."""
@@ -50,35 +54,28 @@ class Motion(NamedTuple):
     hits: Hits
 
 
-def _moved(learned: Learned, theta, z, dt, rule: ImpactRule, contact: bool):
-    """States (2, n, d) after a step, and their derivatives (2 n d, 2 n d + P)."""
-
-    def one(z, theta):
-        system = learned.assemble(theta)
-        stepper = Stepper(dt=dt, impact=rule, project=bool(system.links), contact=contact)
-        out = step(system, z[0], z[1], stepper)
-        return jnp.stack([out.x, out.v])
-
-    return _with_derivatives(one, z, theta)
-
-
-def _with_derivatives(one: Callable, z, theta):
-    size = z.size
-    basis = jnp.eye(size + theta.shape[0], dtype=z.dtype)
+def _with_derivatives(one: Callable, *at: Array):
+    """`one` of arrays, which has something beside, and its derivatives by all numbers of theirs, as one matrix."""
+    flat, unravel = ravel_pytree(at)
 
     def push(t):
-        return jax.jvp(one, (z, theta), (t[:size].reshape(z.shape), t[size:]))
+        return jax.jvp(lambda flat: one(*unravel(flat)), (flat,), (t,), has_aux=True)
 
-    after, slopes = jax.vmap(push, out_axes=(None, 0))(basis)
-    return after, slopes.reshape(len(basis), -1).T
+    after, slopes, beside = jax.vmap(push, out_axes=(None, 0, None))(jnp.eye(len(flat), dtype=flat.dtype))
+    return after, jnp.concatenate([part.reshape(len(flat), -1) for part in jax.tree.leaves(slopes)], axis=1).T, beside
 
 
 @eqx.filter_jit
 def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[Array, " B"], rule):
     system = learned.assemble(theta)
 
+    def alone(dt, z, theta):
+        system = learned.assemble(theta)
+        out = step(system, z[0], z[1], _stepper(learned, dt, rule, contact=False))
+        return jnp.stack([out.x, out.v]), None
+
     def one(z, dt):
-        after, slopes = _moved(learned, theta, z, dt, rule, contact=False)
+        after, slopes, _ = _with_derivatives(functools.partial(alone, dt), z, theta)
         if not system.contacts:
             return after, slopes, jnp.zeros(0, bool)
         start, end = (z[0], z[1]), (after[0], after[1])
@@ -93,8 +90,30 @@ def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[A
 
 
 @eqx.filter_jit
-def _contact_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[Array, " B"], rule):
-    return jax.vmap(lambda z, dt: _moved(learned, theta, z, dt, rule, contact=True))(z, dt)
+def _segments(
+    learned: Learned, theta, start: Float[Array, "B 2 n d"], dt: Float[Array, " B"], now: Progress, count, rule
+):
+    """The next segments of steps: how far they are then, and the derivatives of that, (x, v, left), by the same and
+    theta. By the rule of steps a step is one segment."""
+
+    def segment(start, dt, now: Progress, count, z, left, theta):
+        system, stepper = learned.assemble(theta), _stepper(learned, dt, rule)
+        if rule == "step":
+            out = step(system, z[0], z[1], stepper)
+            return (jnp.stack([out.x, out.v]), 0 * left), now._replace(left=0 * left)
+        inverse_mass = system.inverse_mass_matrix()
+        forward = Segments(system, inverse_mass, stepper, smooth_flow(system, stepper, inverse_mass))
+        end = forward(now._replace(x=z[0], v=z[1], left=left), count)
+        out = end_of_step(system, Progress.begin(system, start[0], start[1], dt), end)
+        x, v = (jnp.where(end.left > 0, *pair) for pair in ((end.x, out.x), (end.v, out.v)))
+        return (jnp.stack([x, v]), end.left), end
+
+    def one(start, dt, now: Progress, count):
+        own = functools.partial(segment, start, dt, now, count)
+        after, slopes, end = _with_derivatives(own, jnp.stack([now.x, now.v]), now.left, theta)
+        return end._replace(x=after[0][0], v=after[0][1]), slopes
+
+    return jax.vmap(one)(start, dt, now, count)
 
 
 @eqx.filter_jit
@@ -103,20 +122,63 @@ def _starts(learned: Learned, theta, z: Float[Array, "W 2 n d"]):
 
     def one(z, theta):
         system = learned.assemble(theta)
-        return jnp.stack(project_state(system.constraints, z[0], z[1], system.inverse_mass_matrix(), steps=3))
+        return jnp.stack(project_state(system.constraints, z[0], z[1], system.inverse_mass_matrix(), steps=3)), None
 
-    return jax.vmap(lambda z: _with_derivatives(one, z, theta))(z)
+    return jax.vmap(lambda z: _with_derivatives(one, z, theta)[:2])(z)
+
+
+def _stepper(learned: Learned, dt: Float[Array, ""], rule: ImpactRule, contact: bool = True) -> Stepper:
+    return Stepper(dt=dt, impact=rule, project=bool(learned.skeleton.links), contact=contact)
 
 
 def _padded(rows: np.ndarray, size: int) -> np.ndarray:
     return rows[np.arange(size).clip(max=len(rows) - 1)]
 
 
+class _Within:
+    """Windows within a step, and the derivatives of how far they are by where they began it and by theta."""
+
+    def __init__(self, system: System, z: Float[np.ndarray, "W 2 n d"], P: int):
+        count, size, n = len(z), z[0].size, system.n_points
+        self.state, self.left = np.zeros_like(z), np.zeros(count)
+        self.acted, self.push = np.zeros((count, system.n_candidates), bool), np.zeros((count, n))
+        self.segments = np.zeros(count, int)
+        self.slopes = np.zeros((count, size + 1, size + P))
+
+    def begin(self, rows: Int[np.ndarray, " R"], state: Float[np.ndarray, "W 2 n d"], dt: Float[np.ndarray, " R"]):
+        """Begin a step of `dt` (s)."""
+        self.state[rows], self.left[rows] = state[rows], dt
+        self.acted[rows], self.push[rows], self.segments[rows], self.slopes[rows] = False, 0, 0, 0
+        size = self.slopes.shape[1] - 1
+        self.slopes[rows[:, None], np.arange(size), np.arange(size)] = 1
+
+    def move_on(self, learned: Learned, theta, rows, state, dt, rule: ImpactRule) -> Int[np.ndarray, " D"]:
+        """Go on by a segment; which windows are at the end of their step."""
+        padded = _padded(rows, NEAR)
+        x, v, left, acted, push, count, start = (
+            jnp.asarray(part[padded])
+            for part in (self.state[:, 0], self.state[:, 1], self.left, self.acted, self.push, self.segments, state)
+        )
+        none = jnp.zeros(len(padded))
+        now = Progress(x, v, left, acted, none > 0, none.astype(int), none, push)
+        end, own = _segments(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule)
+        end, own = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], (end, own))
+        self.state[rows], self.left[rows] = np.stack([end.x, end.v], 1), end.left
+        self.acted[rows], self.push[rows] = end.acted, end.push
+        self.segments[rows] += 1
+        size = self.slopes.shape[1]
+        slopes = own[:, :, :size] @ self.slopes[rows]
+        slopes[:, :, size - 1 :] += own[:, :, size:]
+        self.slopes[rows] = slopes
+        return rows[~(end.left > 0)]
+
+
 class Flow:
     """How windows move: the quantities learned, and the rule of impacts."""
 
     def __init__(self, learned: Learned, rule: ImpactRule):
-        self.learned, self.rule = learned, rule
+        self.learned = learned
+        self.rule: ImpactRule = rule
 
     def __call__(
         self,
@@ -145,6 +207,7 @@ class Flow:
         closed = np.zeros((count, self.learned.skeleton.n_candidates), bool)
         alone = np.zeros((count, half))
         hits: list[tuple] = []
+        within = _Within(self.learned.skeleton, z, P)
 
         def commit(rows, new, own):
             state[rows] = new
@@ -164,6 +227,7 @@ class Flow:
                 touch = near.any(axis=1)
                 waiting[rows[touch]], closed[rows[touch]] = True, near[touch]
                 alone[rows[touch]] = new[touch, 1].reshape(-1, half)
+                within.begin(rows[touch], state, steps[rows[touch], at[rows[touch]]])
                 commit(rows[~touch], new[~touch], own[~touch])
             queue = np.flatnonzero(waiting)
             if not len(queue) and not len(going):
@@ -171,11 +235,8 @@ class Flow:
             if len(queue) < NEAR and np.any((at < length) & ~waiting):
                 continue
             for rows in _batches(queue, NEAR):
-                padded = _padded(rows, NEAR)
-                out = _contact_steps(
-                    self.learned, there, jnp.asarray(state[padded]), jnp.asarray(steps[padded, at[padded]]), self.rule
-                )
-                new, own = (np.asarray(a)[: len(rows)] for a in out)
+                done = within.move_on(self.learned, there, rows, state, steps[rows, at[rows]], self.rule)
+                rows, new, own = done, within.state[done], within.slopes[done][:, :-1]
                 jump = np.linalg.norm(new[:, 1].reshape(-1, half) - alone[rows], axis=1)
                 hit = jump > 1e-9 * np.linalg.norm(alone[rows], axis=1)
                 if hit.any():

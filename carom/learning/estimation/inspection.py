@@ -120,8 +120,7 @@ def _meetings(recording: Recording, system: System) -> list[Finding]:
         return []
     advice = ""
     if found.not_seen and not can_learn_tosses(system):
-        how = "friction and restitution cannot be learned" if system.links else "the command finds them in the motion"
-        advice = f"impacts happen between the samples: {how}"
+        advice = "impacts happen between the samples: the command finds them in the motion"
     out = [Finding("where bodies meet", str(found), advice)]
     return [*out, _impacts(Observations.of(recording), system)] if found.not_seen else out
 

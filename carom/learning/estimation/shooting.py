@@ -13,6 +13,7 @@ exact data, whose motion before impacts fits at once, are learned from as well.
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -27,6 +28,12 @@ MOST = 3.0
 """A step moves a free number by so many of its scales at most."""
 WIDE = 3.0
 """Standard deviation of what a step may move, in scales of the quantities."""
+CHAOTIC = 1e9
+"""Motion whose derivatives by the start have grown to so many times their size there is lost."""
+FAR = 10.0
+"""Motion that is lost is so far off, in sizes of what is seen."""
+EXACT = 0.1
+"""Where so much of the noise is left before impacts, in mean squares, data are better than it was found to be."""
 TIES = 1e-11
 """Curvature of a start below this share is none: constraints hold it."""
 OUTLIER = 6.0
@@ -73,6 +80,7 @@ class Shooting:
         self.used = np.ones(len(windows.x), bool) if used is None else used
         self.seen = np.isfinite(windows.x)
         self.numbers = self.seen.sum(axis=2)
+        self.reach = float(np.nanmax(windows.x) - np.nanmin(windows.x))
         self.kept = self.numbers > 0
         self.fits = np.ones(len(windows.x), bool)
 
@@ -87,19 +95,27 @@ class Shooting:
     def at(self, theta: Float[np.ndarray, " P"], z: Float[np.ndarray, "W 2 n d"]) -> State:
         """The motion from starts `z`."""
         motion = self.flow(theta, z, self.windows.steps)
-        residual = np.where(self.seen, (motion.x - np.where(self.seen, self.windows.x, 0)) / self.noise, 0.0)
-        # A motion that goes wrong is far off, but not lost.
-        return State(theta, z, motion, np.where(np.isfinite(residual), residual, 1e6))
+        # A motion that goes wrong is far off, but not lost: from there on it says nothing of where to go.
+        slopes = np.abs(motion.by_start).max(axis=(2, 3)) / np.abs(motion.by_start[:, :1]).max(axis=(2, 3))
+        sound = np.isfinite(motion.x).all(axis=2) & np.isfinite(motion.by_theta).all(axis=(2, 3)) & (slopes < CHAOTIC)
+        wrong = np.maximum.accumulate(~sound, axis=1)
+        motion.by_start[wrong], motion.by_theta[wrong] = 0.0, 0.0
+        off = np.where(wrong[..., None], FAR * self.reach, motion.x - np.where(self.seen, self.windows.x, 0))
+        return State(theta, z, motion, np.where(self.seen, off / self.noise, 0.0))
 
     def distance(self, state: State) -> Float[np.ndarray, "W T"]:
         """Mean squared residual of each sample; 0 where nothing was seen."""
         return np.sum(state.residual**2, axis=2) / np.maximum(self.numbers, 1)
 
     def size(self, state: State) -> float:
-        """What is left after impacts, typically: a mean squared residual of at least 1."""
-        after = (self.numbers > 0) & ~self.windows.before & self.used[:, None]
-        distance = self.distance(state)[after if after.any() else self.numbers > 0]
-        return max(1.0, float(np.median(distance)))
+        """What is left after impacts, typically: a mean squared residual, of no less than is left before them."""
+        rows, distance = (self.numbers > 0) & self.used[:, None], self.distance(state)
+        before, after = rows & self.windows.before, rows & ~self.windows.before
+        if not before.any():
+            return max(1.0, float(np.median(distance[after if after.any() else self.numbers > 0])))
+        least = float(np.median(distance[before]))
+        least = max(least, self.least) if least < EXACT else 1.0
+        return max(least, float(np.median(distance[after if after.any() else before])))
 
     def of_windows(self, state: State) -> Float[np.ndarray, " W"]:
         """Mean squared residual of each window, starts taken into account."""
@@ -109,7 +125,7 @@ class Shooting:
     def start_numbers(self) -> int:
         """Numbers that a start is free in."""
         system = self.flow.learned.skeleton
-        ties = 0 if not system.links else int(system.constraints(self.windows.start[0, 0]).shape[0])
+        ties = 0 if not system.links else int(system.constraints(jnp.asarray(self.windows.start[0, 0])).shape[0])
         return self.windows.start[0].size - 2 * ties
 
     def weight(self, state: State, size: float, loss: Loss) -> Float[np.ndarray, "W T"]:
@@ -168,12 +184,14 @@ def shoot(
     losses: Sequence[Loss],
     *,
     held: bool = False,
+    still: Bool[np.ndarray, " P"] | None = None,
     each: Callable[[float], None] | None = None,
 ) -> State:
     """Free numbers and starts that fit best, by Gauss-Newton steps from those given.
 
-    **Arguments:** `losses`, the loss of each step at most; `held`: the free numbers stay, starts are fitted; `each` is
-    called after a step with what is left after impacts, a root mean square in units of the noise.
+    **Arguments:** `losses`, the loss of each step at most; `held`: the free numbers stay, starts are fitted; `still`:
+    those of them that stay; `each` is called after a step with what is left after impacts, a root mean square in units
+    of the noise.
     """
     learned, used = shooting.flow.learned, shooting.used | held
     scale, lower, upper = (np.asarray(part, float) for part in (learned.scale, learned.lower, learned.upper))
@@ -190,17 +208,19 @@ def shoot(
         change = np.zeros_like(g)
         if not held and len(g):
             ends = np.maximum(lower - state.theta, -MOST * scale), np.minimum(upper - state.theta, MOST * scale)
+            if still is not None:
+                ends = tuple(np.where(still, 0.0, end) for end in ends)
             change = newton_step(H, g, prior, change, change, *ends)
         directions, curvature, _ = spectrum(H, prior)
         error = np.sqrt(np.sum(directions**2 / curvature, axis=1) * size)
-        still = bool(np.all(np.abs(change) < SETTLED * error))
+        small = bool(np.all(np.abs(change) < SETTLED * error))
         for share in 0.25 ** np.arange(4):
             move = -(share * reduced.own + reduced.follow @ (share * change))
             there = shooting.at(state.theta + share * change, state.z + move.reshape(state.z.shape))
             now = shooting.costs(there, size, loss)
             # At first starts have not been fitted to what comes after impacts. At last a window that no longer fits
             # counts for more than what a step wins.
-            if now[used].sum() < cost[used].sum() or k == 0 or (still and not held):
+            if now[used].sum() < cost[used].sum() or k == 0 or (small and not held):
                 break
         else:
             settled = loss
@@ -211,6 +231,6 @@ def shoot(
         state = there
         if each is not None:
             each(float(np.sqrt(shooting.size(state))))
-        if still and (not held or fallen < SETTLED):
+        if small and (not held or fallen < SETTLED):
             settled = loss
     return state

@@ -56,6 +56,19 @@ class Windows(NamedTuple):
         """Some of them."""
         return Windows(*(part[rows] for part in self))
 
+    def before_impacts(self) -> "Windows":
+        """The free motion that they begin with, alone."""
+        most = max(int(self.before.sum(axis=1).max(initial=1)), 2)
+        steps, x, timing, before, kink = (part[:, :most] for part in self[:5])
+        steps, kink = steps[:, : most - 1], kink[:, : most - 1]
+        return self._replace(
+            steps=np.where(before[:, 1:], steps, np.nan),
+            x=np.where(before[..., None], x, np.nan),
+            timing=timing,
+            before=before,
+            kink=np.zeros_like(kink),
+        )
+
     @classmethod
     def concatenate(cls, parts: Sequence["Windows"]) -> "Windows":
         """All of several."""
