@@ -51,8 +51,10 @@ def is_for_estimator(data: Path | None, learn: Sequence[str], default: Sequence[
     system = chosen.system
     if tuple(learn) != tuple(default) or (system.links and (not system.contacts or system.n_points > MOST_POINTS)):
         return False
-    observed = load_observations(data)
-    return observed.v is None or not shows_impacts(observed, recording_in(data), system)
+    observed, recording = load_observations(data), recording_in(data)
+    if system.links and observed.v is not None and recording is None:
+        return False  # states that something is wrong with: what that is, the trainer says
+    return observed.v is None or not shows_impacts(observed, recording, system)
 
 
 def recording_in(path: Path) -> Recording | None:

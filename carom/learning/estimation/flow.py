@@ -180,6 +180,7 @@ class Flow:
         self.learned = learned
         self.rule: ImpactRule = rule
 
+    @np.errstate(over="ignore", invalid="ignore")  # motion that goes wrong is seen by who asks for it
     def __call__(
         self,
         theta: Float[np.ndarray, " P"],

@@ -92,6 +92,7 @@ class Shooting:
         near = self.distance(state) <= OUTLIER**2 * typical
         self.kept = (self.numbers > 0) & self.fits[:, None] & near
 
+    @np.errstate(over="ignore", invalid="ignore")
     def at(self, theta: Float[np.ndarray, " P"], z: Float[np.ndarray, "W 2 n d"]) -> State:
         """The motion from starts `z`."""
         motion = self.flow(theta, z, self.windows.steps)
