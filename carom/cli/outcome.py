@@ -1,5 +1,6 @@
 """What comes out of a training: what the data tell, and pictures of it, for `learn` and `evaluate`."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS
 from carom.learning.dataset import trajectory_of
 from carom.learning.estimation.identify import MOST_POINTS, Identification, identify
+from carom.learning.estimation.verdict import Estimate
 from carom.learning.evaluate import far_off, state_errors
 from carom.learning.run import TRUTH, RunFolder
 from carom.learning.training.train import quantities
@@ -65,24 +67,22 @@ def estimates_and_fit(system: System, found: Identification | None, measures: di
     parts = {f"mass:{k}": one for k, one in enumerate(found.mass_ratio, 1)}
     for kind in ("friction", "restitution"):
         parts |= {f"{kind}:{k}": one for k, one in enumerate(getattr(found, kind))}
-    return {
-        "estimates": [
-            {
-                "name": name,
-                "of": of[name][0],
-                "value": one.value,
-                "standard_error": one.standard_error,
-                "lower": one.lower,
-                "upper": one.upper,
-                "unit": of[name][1],
-                "verdict": one.verdict if explained else "misfit",
-                "impacts": one.impacts,
-            }
-            for name, one in parts.items()
-            if name in of  # a property that no contact has is no quantity
-        ],
-        "fit": fit,
-    }
+    estimates = [
+        Estimate(
+            name,
+            of[name][0],
+            one.value,
+            one.standard_error,
+            one.lower,
+            one.upper,
+            of[name][1],
+            one.verdict if explained else "misfit",
+            one.impacts,
+        )
+        for name, one in parts.items()
+        if name in of  # a property that no contact has is no quantity
+    ]
+    return {"estimates": [dataclasses.asdict(one) for one in estimates], "fit": fit}
 
 
 def warn_if_far_off(console: Console, measures: dict[str, Any]) -> None:
