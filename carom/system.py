@@ -266,7 +266,7 @@ class System(eqx.Module):
         return traced_candidates(self.contacts, x, self.radii, self.table)
 
     def active(self, x: Float[Array, "n d"], closed: Bool[Array, " C"] | None = None) -> Active:
-        """The closed contacts at `x`, deepest first, padded to `max_active`; `closed`: if not by their gaps, which."""
+        """The closed contacts at `x`, in order, padded to `max_active`; `closed`: if not by their gaps, which."""
         return active_set(self.candidates(x), self._property_index(), self.max_active, self.n_points, closed)
 
     def gaps(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t C"]:

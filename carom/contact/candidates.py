@@ -288,7 +288,7 @@ def traced_candidates(
 
 
 class Active(NamedTuple):
-    """The candidates that enter the solver, deepest first, padded to a fixed number with `active` false.
+    """The candidates that enter the solver, in their order, padded to a fixed number with `active` false.
 
     `overflow` counts closed contacts that found no place: never to be ignored.
     """
@@ -309,13 +309,17 @@ def active_set(
     n_points: int,
     closed: Bool[Array, " C"] | None = None,
 ) -> Active:
-    """Choose the closed contacts (by default, `gap < 0`), deepest first; Jacobian rows of the others are zero.
+    """Choose the closed contacts (by default, `gap < 0`); Jacobian rows of the others are zero.
 
-    Only the chosen contacts get a full Jacobian: candidates may be many.
+    Only the chosen contacts get a full Jacobian: candidates may be many. If they are too many these are the deepest.
+    Their order is that of the candidates: by depth it would hang on the unit, as a bend is in other ones than a
+    stretch, and where the law has several solutions a solver may find another in another order.
     """
+    count = candidates.gap.shape[0]
     by_gap = candidates.gap if closed is None else jnp.where(closed, candidates.gap, jnp.inf)
     closed = candidates.gap < 0 if closed is None else closed
     order = jnp.argsort(by_gap)[:max_active]
+    order = order[jnp.argsort(jnp.where(closed[order], order, count))]
     active = closed[order]
     rows = jnp.where(active[:, None, None, None], candidates.rows[order], 0)
     points = jax.nn.one_hot(jnp.asarray(candidates.stencil)[order], n_points, dtype=rows.dtype)

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from carom.contact.batching import as_one_batch, by_size, contacts_used, solve_chosen
-from carom.contact.cone_algebra import apply, matvec, pick
+from carom.contact.cone_algebra import apply, dot, matvec, pick
 from carom.contact.cones import solve_cones
 from carom.contact.coulomb_law import (
     DELTA,
@@ -50,7 +50,8 @@ from carom.contact.selection import selected
 #
 # Where A is singular the impulse is not unique. A diagonal `delta A_nn` on each contact's own block keeps the steps
 # finite; a last step takes its effect on the velocities away. Of the impulses with the modes that are found the one of
-# least norm is taken (`least_norm.py`): a diagonal alone selects it only to rounding over `delta`.
+# least norm is taken (`least_norm.py`): a diagonal alone selects it only to rounding over `delta`. What nearly is a
+# solution may have one in that, too. So neither rounding nor the frame says which of several solutions is found.
 
 _SOLVED = 1e-10
 """Residual at which a problem counts as solved."""
@@ -64,6 +65,12 @@ _LENGTHS = (1.0, 0.5, 0.2, 0.05)
 """Shares of a Newton step that are tried."""
 LEAST_NORM_STEPS = (8, 80)
 """Steps toward the impulse of least norm: most problems need no more than the first."""
+_NEAR = 1e-7
+"""Residual up to which that impulse may be the solution that Newton's steps miss.
+
+Where contacts are redundant these have rounding over `DELTA` along what moves nothing, which takes contacts at the edge
+of sticking over it.
+"""
 BLOCK = {6: 64}
 """Problems solved together, by the most rows that one has (more rows: 16): the slowest of them holds up the others."""
 
@@ -219,10 +226,32 @@ def _of_least_norm(A, v, friction, lower, reference, impulse, residual, _, steps
     problem, y = scaled.problem, scaled.inside(impulse)
     u, most = matvec(problem.Q, y) + problem.q, jnp.max(steps, initial=0)
     least = least_norm(problem.Q, problem.q, u, y, problem.mu, problem.lower, steps=most)
-    judged = judge(problem, least.y).residual
-    takes = scaled.finite & (judged <= _SOLVED)
+    # As far toward it as contacts go on to slide and to be open, where velocities change on the way.
+    allowed, change = least.allowed, least.y - y
+    faster = matvec(problem.Q, change)
+    rates = [faster[:, 0], -dot(allowed.way, faster[:, 1:])]
+    room = [
+        jnp.where(allowed.closed, jnp.inf, u[:, 0]),
+        jnp.where(allowed.slides, -dot(allowed.way, u[:, 1:]), jnp.inf),
+    ]
+    shares = [
+        jnp.where(rate < 0, left / jnp.where(rate < 0, -rate, 1), jnp.inf)
+        for rate, left in zip(rates, room, strict=True)
+    ]
+    new = y + jnp.clip(jnp.min(jnp.concatenate(shares), axis=0), 0, 1) * change
+    judged = judge(problem, new).residual
+    takes = scaled.finite & least.found & (judged <= _SOLVED)
     residual = jnp.asarray(jnp.where(takes, judged, residual))
-    return _Choice(scaled.outside(jnp.where(takes, least.y, y)), residual, least.found | ~least.singular)
+    return _Choice(scaled.outside(jnp.where(takes, new, y)), residual, takes | ~least.singular)
+
+
+class _Search(NamedTuple):
+    """Where a batch is after some `rounds`: impulses, and how often that of least norm was looked for."""
+
+    round: _Round
+    least: Bool[Array, " B"]  # the impulse is that of least norm
+    looks: Int[Array, " B"]
+    rounds: Int[Array, ""]
 
 
 def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
@@ -235,8 +264,8 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
     start = solve_cones(A, v, friction, lower, reference)
     start = jnp.where(jnp.isfinite(start), start, 0)
 
-    def in_blocks(solve, found, chosen, forms, *more):
-        for size, its in forms:
+    def in_blocks(solve, found, chosen, *more):
+        for size, its in by_size(used, k):
             m = size * d
             arrays = (A[:, :m, :m], *(x[:, :size] for x in (v, friction, lower, reference)))
             arrays += tuple(x[:, :size] if x.ndim > 1 else x for x in (*found, *more))
@@ -244,26 +273,39 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
             found = solve_chosen(solve, arrays, chosen & its, block, found)
         return found
 
-    def one_round(state):
-        count, found = state
-        missing = ~(found.residual <= _SOLVED)
-        return count + 1, in_blocks(_one_round, found, missing, by_size(used, k), jnp.full(batch, count))
+    def missing(search: _Search):
+        return ~(search.round.residual <= _SOLVED) & (search.rounds <= _ROUNDS)
 
-    def keep_going(state):
-        return (state[0] <= _ROUNDS) & jnp.any(~(state[1].residual <= _SOLVED))
+    def to_choose(search: _Search):
+        """What a look for the impulse of least norm may help: also what redundant contacts keep from being solved."""
+        found = search.round
+        near = found.residual <= jnp.where(search.rounds <= _ROUNDS, _NEAR, _SOLVED)
+        return near & ~search.least & (search.looks < len(LEAST_NORM_STEPS)) & (used > 0)
+
+    def body(search: _Search) -> _Search:
+        again = missing(search)
+        found = in_blocks(_one_round, search.round, again, jnp.full(batch, search.rounds))
+        scaled = Scaled.of(A, v, friction, lower, reference)
+        problem, y = scaled.problem, scaled.inside(found.impulse)
+        redundant = are_redundant(problem.Q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
+        looks = jnp.where(again, 0, search.looks)
+        search = _Search(found, jnp.asarray(jnp.where(again, ~redundant, search.least)), looks, search.rounds + 1)
+        wanted = to_choose(search)
+        last = len(LEAST_NORM_STEPS) - 1
+        tried = jnp.where(found.residual <= _SOLVED, jnp.minimum(looks, last), last)
+        steps = jnp.asarray(LEAST_NORM_STEPS)[tried]
+        choice = in_blocks(_of_least_norm, _Choice(found.impulse, found.residual, search.least), wanted, steps)
+        found = _Round(found.swept, choice.impulse, choice.residual)
+        return search._replace(round=found, least=choice.least, looks=jnp.where(wanted, looks + 1, looks))
+
+    def keep_going(search: _Search):
+        return jnp.any(missing(search) | to_choose(search))
 
     unknown = jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
-    _, found = jax.lax.while_loop(keep_going, one_round, (jnp.asarray(0), _Round(start, start, unknown)))
-    found = CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
-    scaled = Scaled.of(A, v, friction, lower, reference)
-    problem, y = scaled.problem, scaled.inside(found.impulse)
-    redundant = are_redundant(problem.Q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
-
-    def choose(go, choice: _Choice) -> _Choice:
-        steps = jnp.asarray(LEAST_NORM_STEPS)[go]
-        return in_blocks(_of_least_norm, choice, ~choice.least, by_size(used, k), jnp.full(batch, steps))
-
-    return CoulombSolution(*jax.lax.fori_loop(0, len(LEAST_NORM_STEPS), choose, _Choice(*found, ~redundant))[:2])
+    none = jnp.zeros(batch, int)
+    begin = _Search(_Round(start, start, unknown), none > 0, none, none[0])
+    found = jax.lax.while_loop(keep_going, body, begin).round
+    return CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
 
 
 _batched = as_one_batch(_solve_batch, "solver of Coulomb's law")

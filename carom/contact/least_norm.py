@@ -28,8 +28,9 @@ from carom.contact.cone_algebra import dot, pick
 #
 #     phi(a) = |z|^2 / 2 - |z - P(z)|^2 / 2 - b a,   z = V a;      phi' = V^T P(z) - b
 #
-# P, the projection onto Y, is piecewise smooth, so that Newton's steps with a shorter one where phi does not fall end
-# in the minimum after a few.
+# P, the projection onto Y, is piecewise smooth, so that Newton's steps end in the minimum after a few, each the one
+# after which phi is least of some lengths and diagonals: phi is flat where all impulses along a way are at an edge, and
+# nearly so where contacts are jammed, with impulses far larger than what is asked for.
 
 _SINGULAR = 1e-9
 """Singular values below this share of the largest one are zero."""
@@ -40,7 +41,9 @@ _STILL = 1e-7
 _STEPS = 80
 _PATIENCE = 12
 """Steps without one that is better by a tenth after which a search ends: modes that nothing can have, or rounding."""
-_LENGTHS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)
+_LENGTHS = (1.0, 10.0, 0.3, 0.1, 0.03, 0.01, 0.001)
+_RIDGES = ((0.0, 1e-13), (1e-5, 1e-10), (1e-2, 1e-10))
+"""Diagonals of a step's matrix: a share of what is missed, and at least. Steps of each are tried."""
 _FOUND = 1e-13
 
 
@@ -95,10 +98,21 @@ def are_redundant(
     mu: Float[Array, "K B"],
     lower: Float[Array, "K B"],
 ) -> Bool[Array, " B"]:
-    """Whether those contacts may be that act with the modes of a solution (see `least_norm`), which alone matter."""
-    rows = jnp.moveaxis(_held(u, y, mu, lower, lifts=False)[1].reshape(len(Q), -1), -1, 0)
-    acting = jnp.where(rows[:, :, None] & rows[:, None], jnp.moveaxis(Q, -1, 0), 0)
-    return _is_singular(acting)
+    """Whether several impulses have the modes of the solution `y`, where contacts leave as Coulomb's law says.
+
+    They move along `G`: on a contact that slides the tangents go with the normal. Then either the velocities are the
+    same, or they are not: sliding may have a continuum of solutions.
+    """
+    allowed, rows = _held(u, y, mu, lower, lifts=False)
+    k, d, batch = y.shape
+    moves = Q.reshape(k * d, k, d, batch)
+    along = jnp.where(allowed.slides, mu, 0)[:, None] * allowed.way
+    moves = moves.at[:, :, 0].add(jnp.sum(moves[:, :, 1:] * along, axis=2)).reshape(k * d, k * d, batch)
+    rows = jnp.moveaxis(rows.reshape(k * d, batch), -1, 0)
+    both = rows[:, :, None] & rows[:, None]
+    acting = jnp.where(both, jnp.moveaxis(moves, -1, 0), jnp.where(rows, 0, 1)[:, None] * jnp.eye(k * d, dtype=y.dtype))
+    pivots = jnp.diagonal(jax.lax.linalg.lu(acting)[0], axis1=1, axis2=2)
+    return ~(jnp.min(jnp.abs(pivots), axis=1) > _REGULAR)
 
 
 def _held(u: Array, y: Array, mu: Array, lower: Array, *, lifts: bool) -> tuple[Allowed, Bool[Array, "K d B"]]:
@@ -195,10 +209,10 @@ def least_norm(
     counts = values > _SINGULAR * values[:, :1]
     V = jnp.where(counts[:, None], jnp.swapaxes(right, 1, 2), 0)
     b = (jnp.einsum("bij,bi->bj", left, jnp.where(rows, wanted, 0)) / jnp.where(counts, values, jnp.inf)).T
-    singular = jnp.sum(counts, axis=1) < jnp.sum(rows, axis=1)
+    singular = jnp.sum(counts, axis=1) < jnp.sum(rows, axis=1) if lifts else are_redundant(Q, u, y, mu, lower)
     size = jnp.maximum(jnp.max(jnp.abs(b), axis=0), 1)
 
-    lengths = jnp.array(_LENGTHS, y.dtype)
+    lengths, ridges = jnp.array(_LENGTHS, y.dtype), jnp.array(_RIDGES, y.dtype).T
     eye = jnp.eye(k * d, dtype=y.dtype)
 
     def look(a: Array) -> tuple[Array, _Look]:
@@ -212,10 +226,13 @@ def least_norm(
     def newton(at: _Look) -> Array:
         whole = block_diagonal(at.D)
         curvature = jnp.einsum("bij,bik,bkl->bjl", V, whole, V)
-        # Flat directions: where all impulses along them are at an edge. The less, the nearer the end.
-        ridge = jnp.clip(0.01 * at.missed, 1e-10, 0.01)[:, None]
-        curvature = curvature + jnp.where(counts, ridge, 1)[..., None] * eye
-        return -jnp.linalg.solve(curvature, at.slope.T[..., None])[..., 0].T
+
+        def step(share: Array, least: Array) -> Array:
+            ridge = jnp.clip(share * at.missed, least, 0.01)[:, None]
+            matrix = curvature + jnp.where(counts, ridge, 1)[..., None] * eye
+            return -jnp.linalg.solve(matrix, at.slope.T[..., None])[..., 0].T
+
+        return jax.vmap(step)(*ridges)
 
     def keep_going(search: _Search):
         going = (search.best.missed > _FOUND) & (search.step - search.since <= _PATIENCE)
@@ -225,8 +242,9 @@ def least_norm(
         at, best, step = search.at, search.best, search.step
         # The first time there is no step, only a look at the start. All is computed for each length, and so written
         # once: to compile it costs more than to run it.
-        change = jax.lax.cond(step > 0, newton, lambda at: jnp.zeros_like(at.a), at)
-        values, looks = jax.vmap(lambda length: look(at.a + length * change))(lengths)
+        change = jax.lax.cond(step > 0, newton, lambda at: jnp.zeros((len(_RIDGES), *at.a.shape), y.dtype), at)
+        trials = at.a + jnp.concatenate([length * change for length in lengths])
+        values, looks = jax.vmap(look)(trials)
         chosen = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0)
         # Near the end values differ by rounding alone.
         new = pick(looks, jnp.where(at.missed < 1e-6, 0, chosen))
