@@ -89,7 +89,6 @@ def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[A
     return jax.vmap(one)(z, dt)
 
 
-@eqx.filter_jit
 def _segments(
     learned: Learned, theta, start: Float[Array, "B 2 n d"], dt: Float[Array, " B"], now: Progress, count, rule
 ):
@@ -114,6 +113,20 @@ def _segments(
         return end._replace(x=after[0][0], v=after[0][1]), slopes
 
     return jax.vmap(one)(start, dt, now, count)
+
+
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+"""What XLA compiles a large program with in two thirds of the time, to code that takes a little longer."""
+
+
+@functools.cache
+def _compiled_segments() -> Callable:
+    """`_segments`, compiled quickly by versions of XLA that can be told to."""
+    try:
+        jax.jit(lambda x: x, compiler_options=QUICK)(0.0)
+    except jax.errors.JaxRuntimeError:
+        return eqx.filter_jit(_segments)
+    return eqx.filter_jit(_segments, compiler_options=QUICK)  # pyright: ignore[reportCallIssue] - not in its stub
 
 
 @eqx.filter_jit
@@ -161,7 +174,7 @@ class _Within:
         )
         none = jnp.zeros(len(padded))
         now = Progress(x, v, left, acted, none > 0, none.astype(int), none, push)
-        end, own = _segments(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule)
+        end, own = _compiled_segments()(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule)
         end, own = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], (end, own))
         self.state[rows], self.left[rows] = np.stack([end.x, end.v], 1), end.left
         self.acted[rows], self.push[rows] = end.acted, end.push
