@@ -14,7 +14,8 @@ from carom.cli.systems import Chosen
 from carom.errors import CaromError
 from carom.learning.config import LearnConfig
 from carom.learning.estimation.estimate import estimate
-from carom.learning.estimation.windows import survey, windows_of
+from carom.learning.estimation.survey import survey
+from carom.learning.estimation.windows import windows_of
 from carom.learning.model_file import load_model_into
 from carom.learning.run import RunFolder
 from carom.recordings.observations import Observations

@@ -65,6 +65,8 @@ _LENGTHS = (1.0, 0.5, 0.2, 0.05)
 """Shares of a Newton step that are tried."""
 LEAST_NORM_STEPS = (8, 80)
 """Steps toward the impulse of least norm: most problems need no more than the first."""
+_LOOKS = 3
+"""Looks for it, where one ends at an edge of what has its modes."""
 _NEAR = 1e-7
 """Residual up to which that impulse may be the solution that Newton's steps miss.
 
@@ -172,14 +174,18 @@ def _polish(problem: Problem, soft: Problem, y: Float[Array, "K d B"], steps: Bo
 
 
 class _Round(NamedTuple):
-    """Where the search for impulses is, batch first: where sweeps go on from, and the best so far (N s)."""
+    """Where the search for impulses is, batch first: where sweeps go on from, and the best so far (N s).
+
+    `redundant`: whether others have its modes.
+    """
 
     swept: Float[Array, "B K d"]
     impulse: Float[Array, "B K d"]
     residual: Float[Array, " B"]
+    redundant: Bool[Array, " B"]
 
 
-def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count) -> _Round:
+def _one_round(A, v, friction, lower, reference, swept, impulse, residual, _, count) -> _Round:
     """Sweeps and Newton steps for one block of problems, batch first in and out; round 0 looks at the start.
 
     Odd rounds from 3 on come down from a large diagonal, with which there is one solution; the others take Newton steps
@@ -209,7 +215,8 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, count
     better = (new.residual < residual) | (count == 0)
     y, worst = (jnp.asarray(jnp.where(better, a, b)) for a, b in ((new.y, start), (new.residual, residual)))
     worst = jnp.asarray(jnp.where(scaled.finite, worst, jnp.inf))
-    return _Round(scaled.outside(swept), scaled.outside(y), worst)
+    redundant = are_redundant(problem.Q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
+    return _Round(scaled.outside(swept), scaled.outside(y), worst, redundant)
 
 
 class _Choice(NamedTuple):
@@ -226,23 +233,26 @@ def _of_least_norm(A, v, friction, lower, reference, impulse, residual, _, steps
     problem, y = scaled.problem, scaled.inside(impulse)
     u, most = matvec(problem.Q, y) + problem.q, jnp.max(steps, initial=0)
     least = least_norm(problem.Q, problem.q, u, y, problem.mu, problem.lower, steps=most)
-    # As far toward it as contacts go on to slide and to be open, where velocities change on the way.
+    # As far toward it as contacts that rub go on to slide, and the open ones to be open, where velocities change on the
+    # way. With what then holds there may be another.
     allowed, change = least.allowed, least.y - y
     faster = matvec(problem.Q, change)
     rates = [faster[:, 0], -dot(allowed.way, faster[:, 1:])]
+    rubs = allowed.slides & (problem.mu > 0) & (allowed.closed | (problem.lower > 0))
     room = [
         jnp.where(allowed.closed, jnp.inf, u[:, 0]),
-        jnp.where(allowed.slides, -dot(allowed.way, u[:, 1:]), jnp.inf),
+        jnp.where(rubs, -dot(allowed.way, u[:, 1:]), jnp.inf),
     ]
     shares = [
         jnp.where(rate < 0, left / jnp.where(rate < 0, -rate, 1), jnp.inf)
         for rate, left in zip(rates, room, strict=True)
     ]
-    new = y + jnp.clip(jnp.min(jnp.concatenate(shares), axis=0), 0, 1) * change
+    share = jnp.clip(jnp.min(jnp.concatenate(shares), axis=0), 0, 1)
+    new = y + share * change
     judged = judge(problem, new).residual
     takes = scaled.finite & least.found & (judged <= _SOLVED)
     residual = jnp.asarray(jnp.where(takes, judged, residual))
-    return _Choice(scaled.outside(jnp.where(takes, new, y)), residual, takes | ~least.singular)
+    return _Choice(scaled.outside(jnp.where(takes, new, y)), residual, (takes & (share == 1)) | ~least.singular)
 
 
 class _Search(NamedTuple):
@@ -273,37 +283,33 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
             found = solve_chosen(solve, arrays, chosen & its, block, found)
         return found
 
+    near = _NEAR if jnp.finfo(v.dtype).eps < _SOLVED else _SOLVED  # else all are near, by rounding
+
     def missing(search: _Search):
         return ~(search.round.residual <= _SOLVED) & (search.rounds <= _ROUNDS)
 
     def to_choose(search: _Search):
         """What a look for the impulse of least norm may help: also what redundant contacts keep from being solved."""
-        found = search.round
-        near = found.residual <= jnp.where(search.rounds <= _ROUNDS, _NEAR, _SOLVED)
-        return near & ~search.least & (search.looks < len(LEAST_NORM_STEPS)) & (used > 0)
+        is_near = search.round.residual <= jnp.where(search.rounds <= _ROUNDS + 1, near, _SOLVED)
+        return is_near & ~search.least & (search.looks < _LOOKS) & (used > 0)
 
     def body(search: _Search) -> _Search:
-        again = missing(search)
+        again, before = missing(search), search.round.residual
         found = in_blocks(_one_round, search.round, again, jnp.full(batch, search.rounds))
-        scaled = Scaled.of(A, v, friction, lower, reference)
-        problem, y = scaled.problem, scaled.inside(found.impulse)
-        redundant = are_redundant(problem.Q, matvec(problem.Q, y) + problem.q, y, problem.mu, problem.lower)
-        looks = jnp.where(again, 0, search.looks)
-        search = _Search(found, jnp.asarray(jnp.where(again, ~redundant, search.least)), looks, search.rounds + 1)
+        looks = jnp.where(again & (found.residual < 0.5 * before), 0, search.looks)
+        least = jnp.asarray(jnp.where(again, ~found.redundant, search.least))
+        search = _Search(found, least, looks, search.rounds + 1)
         wanted = to_choose(search)
-        last = len(LEAST_NORM_STEPS) - 1
-        tried = jnp.where(found.residual <= _SOLVED, jnp.minimum(looks, last), last)
-        steps = jnp.asarray(LEAST_NORM_STEPS)[tried]
+        steps = jnp.asarray(LEAST_NORM_STEPS)[jnp.where((found.residual <= _SOLVED) & (looks == 0), 0, 1)]
         choice = in_blocks(_of_least_norm, _Choice(found.impulse, found.residual, search.least), wanted, steps)
-        found = _Round(found.swept, choice.impulse, choice.residual)
+        found = found._replace(impulse=choice.impulse, residual=choice.residual)
         return search._replace(round=found, least=choice.least, looks=jnp.where(wanted, looks + 1, looks))
 
     def keep_going(search: _Search):
         return jnp.any(missing(search) | to_choose(search))
 
-    unknown = jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype))
-    none = jnp.zeros(batch, int)
-    begin = _Search(_Round(start, start, unknown), none > 0, none, none[0])
+    unknown, none = jnp.where(used > 0, jnp.inf, jnp.zeros(batch, v.dtype)), jnp.zeros(batch, int)
+    begin = _Search(_Round(start, start, unknown, none > 0), none > 0, none, jnp.asarray(0))
     found = jax.lax.while_loop(keep_going, body, begin).round
     return CoulombSolution(jnp.where((used > 0)[:, None, None], found.impulse, 0), found.residual)
 

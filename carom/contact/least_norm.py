@@ -1,8 +1,9 @@
 r"""Of all impulses that contacts may have with given modes the one of least norm. Arrays only.
 
-Where contacts are redundant (`A` is singular) many impulses `y` within the friction cones do the same. With
-`u = Q y + q` the modes of a solution (which contacts are open, stick, and slide where to) say what the others may be: a
-convex set `Y`, a product over the contacts, and a plane,
+Where contacts are redundant (`A` is singular) many impulses `y` within the friction cones do the same; where contacts
+slide, some may meet Coulomb's law that leave other velocities. With `u = Q y + q` the modes of a solution (which
+contacts are open, stick, and slide where to) say what the others may be: a convex set `Y`, a product over the contacts,
+and a plane,
 
     open        y_n = lower,                                    u_n > 0
     closed      y_n >= lower,                                   u_n = 0
@@ -10,7 +11,8 @@ convex set `Y`, a product over the contacts, and a plane,
     sliding     y_t = -mu y_n u_t / |u_t|
 
 The one of least norm in both, the projection of zero, is unique. With `Q` and `y` scaled by each contact's mobility the
-norm is an energy, which knows neither frame nor unit; and nothing hangs on how a solution was found.
+norm is an energy, which knows neither frame nor unit; and nothing hangs on how a solution was found. (But in 3D, where
+velocities change: the way of sliding turns with them.)
 """
 
 from typing import NamedTuple
@@ -108,9 +110,11 @@ def are_redundant(
     moves = Q.reshape(k * d, k, d, batch)
     along = jnp.where(allowed.slides, mu, 0)[:, None] * allowed.way
     moves = moves.at[:, :, 0].add(jnp.sum(moves[:, :, 1:] * along, axis=2)).reshape(k * d, k * d, batch)
-    rows = jnp.moveaxis(rows.reshape(k * d, batch), -1, 0)
-    both = rows[:, :, None] & rows[:, None]
-    acting = jnp.where(both, jnp.moveaxis(moves, -1, 0), jnp.where(rows, 0, 1)[:, None] * jnp.eye(k * d, dtype=y.dtype))
+    own = jnp.diagonal(Q).T.reshape(k * d, batch)
+    rows = rows.reshape(k * d, batch) & (own > 0)
+    size = jnp.where(rows, jax.lax.rsqrt(jnp.asarray(jnp.where(rows, own, 1))), 0)
+    none = jnp.where(rows, 0, 1)[:, None] * jnp.eye(k * d, dtype=y.dtype)[..., None]
+    acting = jnp.moveaxis(size[:, None] * moves * size + none, -1, 0)
     pivots = jnp.diagonal(jax.lax.linalg.lu(acting)[0], axis1=1, axis2=2)
     return ~(jnp.min(jnp.abs(pivots), axis=1) > _REGULAR)
 
@@ -245,9 +249,8 @@ def least_norm(
         change = jax.lax.cond(step > 0, newton, lambda at: jnp.zeros((len(_RIDGES), *at.a.shape), y.dtype), at)
         trials = at.a + jnp.concatenate([length * change for length in lengths])
         values, looks = jax.vmap(look)(trials)
-        chosen = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0)
-        # Near the end values differ by rounding alone.
-        new = pick(looks, jnp.where(at.missed < 1e-6, 0, chosen))
+        values = jnp.where(at.missed < 1e-6, looks.missed, values)  # near the end phi differs by rounding alone
+        new = pick(looks, jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values), axis=0))
         since = jnp.where(new.missed < 0.9 * best.missed, step, search.since)
         better = new.missed < best.missed
         return _Search(new, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best), since, step + 1)

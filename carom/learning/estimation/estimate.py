@@ -19,6 +19,7 @@ from carom.checks import require
 from carom.learning.estimation.flow import Flow
 from carom.learning.estimation.robust import spectrum
 from carom.learning.estimation.shooting import EXACT, LOST, WIDE, Loss, Shooting, State, shoot
+from carom.learning.estimation.survey import Survey, survey
 from carom.learning.estimation.verdict import (
     EXPLAINED,
     WORST,
@@ -30,7 +31,7 @@ from carom.learning.estimation.verdict import (
     spread,
     telling,
 )
-from carom.learning.estimation.windows import Survey, Windows, survey, windows_of
+from carom.learning.estimation.windows import Windows, windows_of
 from carom.learning.unknowns.quantities import Learned
 from carom.recordings.observations import Observations
 from carom.simulation.impact import ImpactRule
@@ -125,7 +126,7 @@ def estimate(
     work.say("looking for impacts", 0.0)
     held = _held_out(observations, test, seed)
     every = observations if test is None else Observations.concatenate([observations, test])
-    found = survey(every)
+    found = survey(every, bent=bool(learned.skeleton.links))
     rules: list[ImpactRule] = ["event"] if impact is None else [impact]
     first = _by_rule(learned, every, found, held, rules[0], _first_values(learned), work, (0.02, 0.98))
     if impact is None and not first.fit.explained and _at_samples(found):

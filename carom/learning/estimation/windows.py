@@ -1,8 +1,6 @@
 """Windows of observed motion, cut between impacts that the motion shows.
 
-Where a body is hit its motion has a kink: the last samples, extended as a parabola, miss the next ones by more than
-their errors allow. That is looked for, never overlap, which the motion of rigid bodies does not show. Windows hold some
-impacts each and are cut in the middle of free motion, so that each sample is in one.
+Windows hold some impacts each and are cut in the middle of free motion, so that each sample is in one.
 """
 
 from collections.abc import Sequence
@@ -13,23 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from carom.checks import require
-from carom.recordings.clock import STEP_TOLERANCE, digit_of
-from carom.recordings.observations import Observations
+from carom.learning.estimation.survey import Survey, Track, design
 
-REACH = 8
-"""Samples from which the next is foretold."""
-LEAST = 4
-"""Fewer do not tell a parabola and its error."""
-DOUBT = 6.0
-"""Standard errors by which a sample must be missed to show a kink."""
-NEIGHBOURS = 2
-"""Kinks found forward and backward that are so many samples apart are one."""
+LEAST, MOST = 8, 16
+"""Samples that a start is found from as a parabola, at least and at most; from fewer as a line."""
 ROOM = 3
 """Samples of free motion that a window has at least at either end."""
-SHARE = 0.1
-"""Errors of positions that are left beside those of their times are this share of all at least."""
-FLOOR = 1e-9
-"""Errors of positions, as a share of how far the motion reaches, are not taken to be less: rounding, amplified."""
 GAP = 1.5
 """Steps longer than this many typical ones are divided."""
 
@@ -95,215 +82,6 @@ class Windows(NamedTuple):
         )
 
 
-class Track(NamedTuple):
-    """One trajectory: its times (s), positions (NaN where not seen), what errors of times make of these (m), and the
-    samples after which there is a kink."""
-
-    time: Float[np.ndarray, " T"]
-    x: Float[np.ndarray, "T n d"]
-    timing: Float[np.ndarray, "T n d"]
-    kinks: Int[np.ndarray, " K"]
-
-
-class Survey(NamedTuple):
-    """What the motions show by themselves: tracks, the errors of each point's positions (m), where in its step each
-    kink is (from 0 to 1) with the error of that, and the typical time step (s)."""
-
-    tracks: tuple[Track, ...]
-    noise: Float[np.ndarray, " n"]
-    floor: float
-    place: Float[np.ndarray, "K 2"]
-    step: float
-
-
-def survey(observations: Observations) -> Survey:
-    """Errors of positions, and kinks of all trajectories."""
-    tracks = []
-    for time, x in zip(observations.time, observations.x, strict=True):
-        there = np.isfinite(time) & np.isfinite(x).any(axis=(1, 2))
-        seen = np.isfinite(x[there]).all(axis=2, keepdims=True)
-        tracks.append((time[there], np.where(seen, x[there], np.nan)))
-    step = float(np.median(np.concatenate([np.diff(time) for time, _ in tracks])))
-    reach = max(float(np.nanmax(x) - np.nanmin(x)) for _, x in tracks)
-    floor = FLOOR * reach
-    digit = _digit(observations, step)
-    timing = [_timing(time, x, digit) for time, x in tracks]
-    noise = np.maximum(_noise([(t, x, np.zeros(0, int)) for t, x in tracks], robust=True), floor)
-    misses = [_misses(time, x) for time, x in tracks]
-    found = []
-    for _ in range(2):
-        found = [(t, x, _kinks(missed, noise)) for (t, x), missed in zip(tracks, misses, strict=True)]
-        noise = np.maximum(_noise(found, robust=False), floor)
-    places = [_place(t, x, k, kinks, noise) for t, x, kinks in found for k in kinks.tolist()]
-    places = [place for place in places if place is not None]
-    by_time = np.nanmean(np.concatenate(timing) ** 2, axis=(0, 2))
-    own = np.sqrt(np.maximum(noise**2 - by_time, np.maximum(floor, SHARE * noise) ** 2))
-    return Survey(
-        tuple(Track(t, x, off, kinks) for (t, x, kinks), off in zip(found, timing, strict=True)),
-        own,
-        floor,
-        np.array(places).reshape(-1, 2),
-        step,
-    )
-
-
-def _digit(observations: Observations, step: float) -> float:
-    """What the last digit of times is worth (s); none where all are at whole steps, which rounding has not moved."""
-    steps = np.diff(observations.time, axis=1) / step
-    steps = steps[np.isfinite(steps)]
-    if np.all(np.abs(steps - np.round(steps)) <= STEP_TOLERANCE * np.maximum(steps, 1)):
-        return 0.0
-    return digit_of(observations.time, np.isfinite(observations.time))
-
-
-def _timing(time: np.ndarray, x: np.ndarray, digit: float) -> Float[np.ndarray, "T n d"]:
-    """What rounding of times to a digit makes of positions: how far they move within it, by a uniform error."""
-    out = np.zeros_like(x)
-    for p in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[:, p, 0]))
-        if len(rows) > 1:
-            out[rows, p] = np.abs(np.gradient(x[rows, p], time[rows], axis=0)) * digit / np.sqrt(12)
-    return out
-
-
-def _design(time: np.ndarray, order: int) -> np.ndarray:
-    return time[:, None] ** np.arange(order + 1)
-
-
-def _noise(tracks, *, robust: bool) -> Float[np.ndarray, " n"]:
-    """Standard deviation of errors of each point, from parabolas through `REACH` samples without a kink.
-
-    If `robust`, the median of theirs: kinks have not been found yet.
-    """
-    n, d = tracks[0][1].shape[1:]
-    own: list[list[float]] = [[] for _ in range(n)]
-    for time, x, kinks in tracks:
-        ends = [-1, *kinks, len(time) - 1]
-        for p in range(n):
-            runs = []
-            for a, b in pairwise(ends):
-                rows = np.arange(a + 1, b + 1)
-                rows = rows[np.isfinite(x[rows, p, 0])]
-                runs += [rows[k : k + REACH] for k in range(0, len(rows) - REACH + 1, 3 if robust else REACH)]
-            if not runs:
-                continue
-            r = np.array(runs)
-            span = time[r] - time[r[:, :1]]
-            design = (span / span[:, -1:])[..., None] ** np.arange(3)
-            basis = np.linalg.qr(design)[0]
-            left = x[r, p] - np.einsum("kma,kna,knd->kmd", basis, basis, x[r, p])
-            own[p] += np.sum(left**2, axis=(1, 2)).tolist()
-    out = np.zeros(n)
-    every = [value for part in own for value in part]
-    for p, part in enumerate(own):
-        part = part or every or [0.0]
-        dof = (REACH - 3) * d
-        out[p] = np.median(part) / (dof * (1 - 2 / (9 * dof)) ** 3) if robust else _clean(part, dof)
-    return np.sqrt(out)
-
-
-def _clean(part: list[float], dof: int) -> float:
-    """Mean of sums of squares over their degrees of freedom, without the few that hold a kink which was not seen."""
-    values = np.array(part) / dof
-    limit = np.median(values) * (1 + 5 * np.sqrt(2 / dof))
-    return float(np.mean(values[values <= limit]))
-
-
-def _missed(time: np.ndarray, x: np.ndarray) -> Float[np.ndarray, "M T 2"]:
-    """Errors of positions (m) at which samples k and k + 1 are missed by just a standard error.
-
-    By the parabola through the m samples before k, for m from `LEAST` to `REACH`; infinite where there are not so many.
-    """
-    count, d = x.shape
-    out = np.full((REACH - LEAST + 1, count, 2), np.inf)
-    for m in range(LEAST, min(REACH, count - 1) + 1):
-        k = np.arange(m, count)
-        rows = k[:, None] - m + np.arange(m)
-        scale = time[k] - time[rows[:, 0]]
-        design = ((time[rows] - time[k, None]) / scale[:, None])[..., None] ** np.arange(3)
-        inverse = np.linalg.inv(np.einsum("kma,kmb->kab", design, design))
-        fit = np.einsum("kab,kmb,kmd->kad", inverse, design, x[rows])
-        for ahead in range(2):
-            j = k[: len(k) - ahead]
-            at = ((time[j + ahead] - time[j]) / scale[: len(j)])[:, None] ** np.arange(3)
-            off = x[j + ahead] - np.einsum("ka,kad->kd", at, fit[: len(j)])
-            spread = 1 + np.maximum(np.einsum("ka,kab,kb->k", at, inverse[: len(j)], at), 0)
-            out[m - LEAST, j, ahead] = np.linalg.norm(off, axis=1) / np.sqrt(d * spread)
-    out[:, count - 1, 1] = np.inf  # nothing comes after the last
-    return out
-
-
-class _Misses(NamedTuple):
-    """Of each point: the samples in which it was seen, and how much these are missed by, forward and backward."""
-
-    rows: list[np.ndarray]
-    forward: list[np.ndarray]
-    backward: list[np.ndarray]
-
-
-def _misses(time: np.ndarray, x: np.ndarray) -> _Misses:
-    rows = [np.flatnonzero(np.isfinite(x[:, p, 0])) for p in range(x.shape[1])]
-    forward = [_missed(time[r], x[r, p]) for p, r in enumerate(rows)]
-    backward = [_missed(-time[r][::-1], x[r, p][::-1]) for p, r in enumerate(rows)]
-    return _Misses(rows, forward, backward)
-
-
-def _kinks(misses: _Misses, noise: np.ndarray) -> Int[np.ndarray, " K"]:
-    """Samples after which a point's motion has a kink: the next two samples are missed.
-
-    Looked for backward too, which shows those that come before there is a parabola; of two neighbours the first stays.
-    """
-    found: set[int] = set()
-    for rows, ahead, back, size in zip(*misses, noise, strict=True):
-        forward = _one_way(ahead > DOUBT * size)
-        backward = [len(rows) - 2 - k for k in _one_way(back > DOUBT * size)]
-        found |= {int(rows[k]) for k in forward}
-        found |= {int(rows[k]) for k in backward if not any(abs(k - other) <= NEIGHBOURS for other in forward)}
-    return np.array(sorted(found), int)
-
-
-def _one_way(missed: Bool[np.ndarray, "M T 2"]) -> list[int]:
-    found, begin, k = [], 0, LEAST
-    while k < missed.shape[1]:
-        if missed[min(k - begin, REACH) - LEAST, k].all():
-            found.append(k - 1)
-            begin, k = k, k + LEAST
-        else:
-            k += 1
-    return found
-
-
-def _place(time, x, k: int, kinks, noise) -> tuple[float, float] | None:
-    """Where in the step after sample `k` the parabolas of both sides meet, and the error of that, both in steps.
-
-    Of the point that is hit hardest; None where there is too little motion on one side.
-    """
-    ends = np.array([-1, *kinks, len(time) - 1])
-    left, right = np.arange(max(ends[ends < k].max() + 1, k - REACH + 1), k + 1), np.arange(k + 1, ends[ends > k].min())
-    best = None
-    length = time[k + 1] - time[k]
-    for p in range(x.shape[1]):
-        sides = []
-        for rows in (left, right[:REACH]):
-            rows = rows[np.isfinite(x[rows, p, 0])]
-            if len(rows) < LEAST + 1:
-                break
-            design = _design((time[rows] - time[k]) / length, 2)
-            inverse = np.linalg.inv(design.T @ design)
-            sides.append((inverse @ design.T @ x[rows, p], inverse[0, 0]))
-        if len(sides) < 2:
-            continue
-        (a, va), (b, vb) = sides
-        jump = a[1] - b[1]
-        size = float(jump @ jump)
-        if best is None or size > best[0]:
-            best = size, float((b[0] - a[0]) @ jump / size), float(noise[p] * np.sqrt((va + vb) / size))
-    return None if best is None else best[1:]
-
-
-# --- windows ----------------------------------------------------------------------------------------------------------
-
-
 def windows_of(found: Survey, impacts: int | None) -> Windows:
     """All motions in windows of so many impacts (None: as many as there are)."""
     parts = []
@@ -365,11 +143,11 @@ def _start(time: np.ndarray, x: np.ndarray, end: int) -> Float[np.ndarray, "2 n 
     """Position and velocity of each point at the first time, from the samples up to `end`; None if it is not seen."""
     out = np.zeros((2, *x.shape[1:]))
     for p in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[: end + 1, p, 0]))[: 2 * REACH]
+        rows = np.flatnonzero(np.isfinite(x[: end + 1, p, 0]))[:MOST]
         if len(rows) < 2:
             return None
         scale = time[rows[-1]] - time[0]
-        order = 2 if len(rows) >= 2 * LEAST else 1
-        fit = np.linalg.lstsq(_design((time[rows] - time[0]) / scale, order), x[rows, p], rcond=None)[0]
+        order = 2 if len(rows) >= LEAST else 1
+        fit = np.linalg.lstsq(design((time[rows] - time[0]) / scale, order), x[rows, p], rcond=None)[0]
         out[0, p], out[1, p] = fit[0], fit[1] / scale
     return out
