@@ -301,3 +301,27 @@ def test_a_bob_on_a_rod_tells_gravity_and_restitution():
         assert abs(one.value - true[one.name]) < 1e-6 * abs(true[one.name])
         assert one.lower < true[one.name] < one.upper
     assert {one.verdict for one in told.estimates} == {"identified"}
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("noise", [0.0, 2e-5])
+def test_kinks_of_bent_motion_are_those_of_impacts(noise, scale):
+    """Points that go round in circles, once thrown back: no parabola, and a kink there alone."""
+    time = np.arange(101) * 0.01
+    rng = np.random.default_rng(3)
+    x = np.zeros((8, len(time), 2, 2))
+    hits = []
+    for one in x:
+        hit, before, after = rng.uniform(0.3, 0.7), rng.uniform(5, 9), -rng.uniform(4, 8)
+        angle = np.where(time < hit, before * (time - hit), after * (time - hit)) + rng.uniform(0, 6)
+        one[:, 0] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        one[:, 1] = 0.5 * np.stack([np.cos(angle + 1), np.sin(angle + 1)], axis=1)
+        hits.append(int(hit / 0.01))
+    seen = Observations.checked(scale * (x + noise * rng.normal(size=x.shape)), np.tile(time, (8, 1)))
+    found = survey(seen, bent=True)
+    assert [track.kinks.tolist() for track in found.tracks] == [[k] for k in hits]
+    starts = windows_of(found, 1).start
+    first = scale * x[:, 0]
+    np.testing.assert_allclose(starts[:, 0], first, atol=scale * (5e-5 + 3 * noise))
+    if noise:
+        np.testing.assert_allclose(found.noise, scale * noise, rtol=0.3)

@@ -52,13 +52,14 @@ class Track(NamedTuple):
 
 class Survey(NamedTuple):
     """What the motions show by themselves: tracks, the errors of each point's positions (m), where in its step each
-    kink is (from 0 to 1) with the error of that, and the typical time step (s)."""
+    kink is (from 0 to 1) with the error of that, the typical time step (s), and what polynomials foretold best."""
 
     tracks: tuple[Track, ...]
     noise: Float[np.ndarray, " n"]
     floor: float
     place: Float[np.ndarray, "K 2"]
     step: float
+    shape: Shape
 
 
 def survey(observations: Observations, *, bent: bool = False) -> Survey:
@@ -98,6 +99,7 @@ def survey(observations: Observations, *, bent: bool = False) -> Survey:
         floor,
         np.array(places).reshape(-1, 2),
         step,
+        shape,
     )
 
 

@@ -11,10 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from carom.checks import require
-from carom.learning.estimation.survey import Survey, Track, design
+from carom.learning.estimation.survey import Shape, Survey, Track, design
 
-LEAST, MOST = 8, 16
-"""Samples that a start is found from as a parabola, at least and at most; from fewer as a line."""
 ROOM = 3
 """Samples of free motion that a window has at least at either end."""
 GAP = 1.5
@@ -121,7 +119,7 @@ def _cuts(track: Track, impacts: int | None) -> list[tuple[int, int]]:
 def _window(found: Survey, track: Track, number: int, first: int, last: int) -> Windows | None:
     time, x = track.time[first : last + 1], track.x[first : last + 1]
     inside = track.kinks[(track.kinks >= first) & (track.kinks < last)] - first
-    start = _start(time, x, int(inside[0]) if len(inside) else len(time) - 1)
+    start = _start(time, x, int(inside[0]) if len(inside) else len(time) - 1, found.shape)
     if start is None:
         return None
     pieces = [max(1, int(np.ceil(step / (GAP * found.step)))) for step in np.diff(time)]
@@ -139,15 +137,19 @@ def _window(found: Survey, track: Track, number: int, first: int, last: int) -> 
     return Windows(*(part[None] for part in one))
 
 
-def _start(time: np.ndarray, x: np.ndarray, end: int) -> Float[np.ndarray, "2 n d"] | None:
-    """Position and velocity of each point at the first time, from the samples up to `end`; None if it is not seen."""
+def _start(time: np.ndarray, x: np.ndarray, end: int, shape: Shape) -> Float[np.ndarray, "2 n d"] | None:
+    """Position and velocity of each point at the first time, from the samples up to `end`; None if it is not seen.
+
+    From twice as many as kinks are looked for with where they are on a parabola, but as a line from few.
+    """
     out = np.zeros((2, *x.shape[1:]))
+    bent = shape.jump > 0
     for p in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[: end + 1, p, 0]))[:MOST]
+        rows = np.flatnonzero(np.isfinite(x[: end + 1, p, 0]))[: shape.reach * (1 if bent else 2)]
         if len(rows) < 2:
             return None
         scale = time[rows[-1]] - time[0]
-        order = 2 if len(rows) >= LEAST else 1
+        order = min(shape.order, max(len(rows) - 2, 1)) if bent or len(rows) >= 2 * shape.least else 1
         fit = np.linalg.lstsq(design((time[rows] - time[0]) / scale, order), x[rows, p], rcond=None)[0]
         out[0, p], out[1, p] = fit[0], fit[1] / scale
     return out
