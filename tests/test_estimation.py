@@ -325,3 +325,36 @@ def test_kinks_of_bent_motion_are_those_of_impacts(noise, scale):
     np.testing.assert_allclose(starts[:, 0], first, atol=scale * (5e-5 + 3 * noise))
     if noise:
         np.testing.assert_allclose(found.noise, scale * noise, rtol=0.3)
+
+
+def _rounds(samples, rate, phase=0.0, dt=0.01):
+    angle = rate * np.arange(samples) * dt + phase
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
+
+
+def _with_a_seldom_seen_point():
+    x = np.array([np.concatenate([_rounds(100, 5), _rounds(100, 4)], axis=1)] * 3)
+    x[:, 9:, 1] = np.nan
+    x[0, :, 1] = np.nan
+    return x, np.arange(100) * 0.01
+
+
+def _with_a_gap():
+    time = np.arange(200) * 0.01 + np.where(np.arange(200) < 100, 0, 10.0)
+    return np.stack([np.cos(time), np.sin(time)], axis=1)[None, :, None], time
+
+
+BENT = {
+    "one is faster": (np.array([*(_rounds(100, 5, i) for i in range(5)), _rounds(100, 15)]), np.arange(100) * 0.01),
+    "short": (np.array([_rounds(9, 5)] * 2), np.arange(9) * 0.01),
+    "very short": (np.array([_rounds(5, 5)] * 2), np.arange(5) * 0.01),
+    "seldom seen": _with_a_seldom_seen_point(),
+    "a gap": _with_a_gap(),
+}
+
+
+@pytest.mark.parametrize("name", list(BENT))
+def test_bent_motion_that_nothing_hits_has_no_kink(name):
+    x, time = BENT[name]
+    found = survey(Observations.checked(x, np.tile(time, (len(x), 1))), bent=True)
+    assert not any(len(track.kinks) for track in found.tracks)

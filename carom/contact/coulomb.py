@@ -296,7 +296,8 @@ def _solve_batch(A, v, friction, lower, reference) -> CoulombSolution:
     def body(search: _Search) -> _Search:
         again, before = missing(search), search.round.residual
         found = in_blocks(_one_round, search.round, again, jnp.full(batch, search.rounds))
-        looks = jnp.where(again & (found.residual < 0.5 * before), 0, search.looks)
+        better = (found.residual < 0.5 * before) | (found.residual <= _SOLVED)
+        looks = jnp.where(again & better, 0, search.looks)
         least = jnp.asarray(jnp.where(again, ~found.redundant, search.least))
         search = _Search(found, least, looks, search.rounds + 1)
         wanted = to_choose(search)

@@ -19,19 +19,21 @@ from carom.recordings.observations import Observations
 class Shape(NamedTuple):
     """Polynomials of an `order` through the last samples, of which at least `least` are needed and `reach` are taken.
 
-    A kink is missed by more than `jump` times what the two samples before it were.
+    A kink is missed by more than `jump` times what the two samples that were foretold before it were. Samples behind a
+    step that is longer than `gap` typical ones are not foretold.
     """
 
     order: int
     least: int
     reach: int
     jump: float
+    gap: float
 
 
-PARABOLA = Shape(2, 4, 8, 0.0)
-BENT = tuple(Shape(order, order + 2, order + 6, 5.0) for order in (2, 3, 4))
+PARABOLA = Shape(2, 4, 8, 0.0, 1000.0)
+BENT = tuple(Shape(order, order + 2, order + 6, 5.0, 10.0) for order in (2, 3, 4))
 DOUBT = 6.0
-"""Standard errors by which a sample must be missed to show a kink."""
+"""Standard errors by which a sample must be missed to show a kink; of bent motion, medians of what is missed."""
 NEIGHBOURS = 2
 """Kinks found forward and backward that are so many samples apart are one."""
 SHARE = 0.1
@@ -77,10 +79,12 @@ def survey(observations: Observations, *, bent: bool = False) -> Survey:
     shapes = BENT if bent else (PARABOLA,)
     every = [[_misses(time, x, shape) for time, x in tracks] for shape in shapes]
     # The order that foretells best: a higher one follows what bends, a lower one is misled less by errors.
-    best = int(np.argmin([np.median(_usual(misses, raw=True)) for misses in every]))
+    best = int(np.argmin([_size(_usual(misses, raw=True)) for misses in every])) if bent else 0
     shape, misses = shapes[best], every[best]
     if bent:
-        limit = np.maximum(_usual(misses), floor)
+        usual = np.maximum(_usual(misses), floor)
+        known = usual[np.isfinite(usual)]
+        limit = np.where(np.isfinite(usual), usual, np.median(known) if len(known) else np.sqrt(np.finfo(float).max))
         found = [(t, x, _kinks(missed, limit, shape)) for (t, x), missed in zip(tracks, misses, strict=True)]
         noise = np.maximum(_noise(found, shape, robust=True), floor)
     else:
@@ -130,7 +134,8 @@ def design(time: Float[np.ndarray, "*T"], order: int) -> Float[np.ndarray, "*T m
 def _noise(tracks, shape: Shape, *, robust: bool) -> Float[np.ndarray, " n"]:
     """Standard deviation of errors of each point, from polynomials through `reach` samples without a kink.
 
-    If `robust`, the median of theirs: kinks have not been found yet.
+    If `robust`, the median of theirs: not all kinks have been found. Of exact motion that is bent it is what the
+    polynomials do not follow.
     """
     n, d = tracks[0][1].shape[1:]
     own: list[list[float]] = [[] for _ in range(n)]
@@ -173,19 +178,26 @@ def _missed(time: np.ndarray, x: np.ndarray, shape: Shape) -> Float[np.ndarray, 
     """
     count, d = x.shape
     out = np.full((shape.reach - shape.least + 1, count, 2, 2), np.inf)
+    if count <= shape.least:
+        return out
+    steps = np.diff(time)
+    longest = shape.gap * np.median(steps)
     for m in range(shape.least, min(shape.reach, count - 1) + 1):
         k = np.arange(m, count)
         rows = k[:, None] - m + np.arange(m)
+        near = np.max(steps[rows], axis=1) <= longest  # the last is that to sample k
+        k, rows = k[near], rows[near]
         scale = time[k] - time[rows[:, 0]]
         powers = design((time[rows] - time[k, None]) / scale[:, None], shape.order)
         inverse = np.linalg.inv(np.einsum("kma,kmb->kab", powers, powers))
         fit = np.einsum("kab,kmb,kmd->kad", inverse, powers, x[rows])
         for ahead in range(2):
-            j = k[: len(k) - ahead]
-            at = design((time[j + ahead] - time[j]) / scale[: len(j)], shape.order)
-            off = np.linalg.norm(x[j + ahead] - np.einsum("ka,kad->kd", at, fit[: len(j)]), axis=1) / np.sqrt(d)
-            spread = 1 + np.maximum(np.einsum("ka,kab,kb->k", at, inverse[: len(j)], at), 0)
-            out[m - shape.least, j, ahead] = np.stack([off, off / np.sqrt(spread)], axis=1)
+            there = k + ahead < count
+            j = k[there] + ahead
+            at = design((time[j] - time[k[there]]) / scale[there], shape.order)
+            off = np.linalg.norm(x[j] - np.einsum("ka,kad->kd", at, fit[there]), axis=1) / np.sqrt(d)
+            spread = 1 + np.maximum(np.einsum("ka,kab,kb->k", at, inverse[there], at), 0)
+            out[m - shape.least, k[there], ahead] = np.stack([off, off / np.sqrt(spread)], axis=1)
     out[:, count - 1, 1] = np.inf  # nothing comes after the last
     return out
 
@@ -206,13 +218,22 @@ def _misses(time: np.ndarray, x: np.ndarray, shape: Shape) -> _Misses:
 
 
 def _usual(misses: list[_Misses], raw: bool = False) -> Float[np.ndarray, " n"]:
-    """By how much the next sample is missed in the median, at each point: in m if `raw`, else in standard errors."""
+    """By how much the next sample is missed in the median, at each point: in m if `raw`, else in standard errors.
+
+    NaN where there are too few samples to tell.
+    """
     out = []
     for p in range(len(misses[0].rows)):
         parts = np.concatenate([one.forward[p][-1, :, 0, 0 if raw else 1] for one in misses])
         parts = parts[np.isfinite(parts)]
-        out.append(np.median(parts) if len(parts) else 0.0)
+        out.append(np.median(parts) if len(parts) else np.nan)
     return np.array(out)
+
+
+def _size(usual: Float[np.ndarray, " n"]) -> float:
+    """Of all points; infinite where one cannot be told."""
+    size = float(np.sqrt(np.mean(usual**2)))
+    return size if np.isfinite(size) else np.inf
 
 
 def _kinks(misses: _Misses, noise: np.ndarray, shape: Shape) -> Int[np.ndarray, " K"]:
@@ -227,9 +248,10 @@ def _kinks(misses: _Misses, noise: np.ndarray, shape: Shape) -> Int[np.ndarray, 
         backward = [len(rows) - 2 - k for k in _one_way(back[..., 1] / size, shape)]
         found |= {int(rows[k]) for k in forward}
         found |= {int(rows[k]) for k in backward if not any(abs(k - other) <= NEIGHBOURS for other in forward)}
-    kinks = sorted(found)
-    if shape.jump:
-        kinks = [k for k, before in zip(kinks, [-np.inf, *kinks], strict=False) if k - before > NEIGHBOURS]
+    kinks: list[int] = []
+    for k in sorted(found):
+        if not shape.jump or not kinks or k - kinks[-1] > NEIGHBOURS:
+            kinks.append(k)
     return np.array(kinks, int)
 
 
@@ -238,7 +260,12 @@ def _one_way(missed: Float[np.ndarray, "M T 2"], shape: Shape) -> list[int]:
     usual: list[float] = []
     while k < missed.shape[1]:
         next_two = missed[min(k - begin, shape.reach) - shape.least, k]
-        if (next_two > DOUBT).all() and next_two[0] > shape.jump * max(usual[-2:], default=0.0):
+        if np.isinf(next_two[0]):  # behind a gap
+            k, usual = k + 1, []
+            continue
+        # Of bent motion the first sample says how well it is foretold; what hits it there is seen from behind.
+        before = max(usual[-2:], default=np.inf if shape.jump else 0.0)
+        if (next_two > DOUBT).all() and next_two[0] > shape.jump * before:
             found.append(k - 1)
             begin, k, usual = k, k + shape.least, []
         else:

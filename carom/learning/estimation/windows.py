@@ -140,7 +140,8 @@ def _window(found: Survey, track: Track, number: int, first: int, last: int) -> 
 def _start(time: np.ndarray, x: np.ndarray, end: int, shape: Shape) -> Float[np.ndarray, "2 n d"] | None:
     """Position and velocity of each point at the first time, from the samples up to `end`; None if it is not seen.
 
-    From twice as many as kinks are looked for with where they are on a parabola, but as a line from few.
+    On a parabola, from twice as many as kinks are looked for with, or as a line from few. Of bent motion by the order
+    that foretells it, from as many; by a lower one from few, and where the point is seen late only.
     """
     out = np.zeros((2, *x.shape[1:]))
     bent = shape.jump > 0
@@ -149,7 +150,10 @@ def _start(time: np.ndarray, x: np.ndarray, end: int, shape: Shape) -> Float[np.
         if len(rows) < 2:
             return None
         scale = time[rows[-1]] - time[0]
-        order = min(shape.order, max(len(rows) - 2, 1)) if bent or len(rows) >= 2 * shape.least else 1
+        order = 2 if len(rows) >= 2 * shape.least else 1
+        if bent:
+            late = time[rows[0]] - time[0] > (time[rows[-1]] - time[rows[0]]) / 3
+            order = 1 if late else max(1, min(shape.order, len(rows) // 2 - 1))
         fit = np.linalg.lstsq(design((time[rows] - time[0]) / scale, order), x[rows, p], rcond=None)[0]
         out[0, p], out[1, p] = fit[0], fit[1] / scale
     return out
