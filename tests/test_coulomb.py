@@ -13,22 +13,57 @@ ROOM = 6
 solve = jax.jit(solve_coulomb_problem)
 
 
+def _drawn(d):
+    """Matrices, velocities and frictions of 900 problems, random and degenerate."""
+    rng = np.random.default_rng(8)
+    made = [generate(rng, family, 64, ROOM, d) for family in FAMILIES]
+    drawn = [(p.A, p.v, p.friction) for p in made]
+    drawn += [rigid_bodies(rng, 64, ROOM, d, contacts) for contacts in range(1, ROOM + 1)]
+    return tuple(np.concatenate(part) for part in zip(*drawn, strict=True))
+
+
 @pytest.mark.slow
 @pytest.mark.ci_budget
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_law_holds(d):
     """To 1e-8 in 99.9 of 100 problems, singular ones among them; the others say so. Here at most one of 900 may be."""
-    rng = np.random.default_rng(8)
-    made = [generate(rng, family, 64, ROOM, d) for family in FAMILIES]
-    drawn = [(p.A, p.v, p.friction) for p in made]
-    drawn += [rigid_bodies(rng, 64, ROOM, d, contacts) for contacts in range(1, ROOM + 1)]
-    A, v, mu = (np.concatenate(part) for part in zip(*drawn, strict=True))
+    A, v, mu = _drawn(d)
     out = solve(A, v, mu)
     reported, missed = np.asarray(out.residual), law(A, v, mu, np.asarray(out.impulse))
     assert np.sum(reported > 1e-8) <= 1
     # What is called solved is: to the reported tolerance in slightly other units.
     assert np.max(missed[reported <= 1e-8]) < 1e-7
     assert np.mean(missed > 1e-8) < 2e-3
+
+
+@pytest.mark.slow
+@pytest.mark.ci_budget
+@pytest.mark.parametrize("frame", ["turned", "other units"])
+@pytest.mark.parametrize("d", [2, 3])
+def test_velocities_are_the_same_in_every_frame(d, frame):
+    """Also where the law has several solutions; in 3D a hundredth may be another, as sliding in a continuum may."""
+    A, v, mu = _drawn(d)
+    rng = np.random.default_rng(9)
+    turn = np.broadcast_to(np.eye(d), (*v.shape, d)).copy()
+    by_mass, by_speed = (1.0, 1.0) if frame == "turned" else (3e-3, 7e2)
+    if frame == "turned":  # the tangents of each contact; mirrored in 2D
+        turn[..., 1:, 1:] = np.linalg.qr(rng.normal(size=(*v.shape[:2], d - 1, d - 1)))[0]
+        turn[..., 1:, 1:] *= np.where(rng.random(v.shape[:2]) < 0.5, -1, 1)[..., None, None]
+    whole = np.zeros_like(A)
+    for k in range(ROOM):
+        whole[:, k * d : k * d + d, k * d : k * d + d] = turn[:, k]
+    other = by_mass * whole @ A @ whole.swapaxes(1, 2)
+
+    def after(A, v):
+        out = solve(A, v, mu)
+        return v + np.einsum("bij,bj->bi", A, np.asarray(out.impulse).reshape(len(v), -1)).reshape(v.shape), out
+
+    here, solved = after(A, v)
+    there, also = after((other + other.swapaxes(1, 2)) / 2, by_speed * np.einsum("bkij,bkj->bki", turn, v))
+    there = np.einsum("bkji,bkj->bki", turn, there) / by_speed
+    off = np.abs(here - there).max((1, 2)) > 1e-7 * np.maximum(np.abs(here), np.abs(v)).max((1, 2))
+    off &= (np.asarray(solved.residual) < 1e-8) & (np.asarray(also.residual) < 1e-8)
+    assert off.mean() <= (0 if d == 2 else 0.01)
 
 
 @pytest.mark.slow

@@ -47,8 +47,7 @@ def _steps(name, model):
 def _cases():
     for name in SCENES:
         for model in MODELS:
-            marks = [pytest.mark.ci_budget] if (name, model) == ("three_disks", "coulomb") else []
-            yield pytest.param(name, model, marks=marks)
+            yield name, model
 
 
 @pytest.mark.slow
