@@ -345,7 +345,6 @@ def _with_a_gap():
 
 
 BENT = {
-    "one is faster": (np.array([*(_rounds(100, 5, i) for i in range(5)), _rounds(100, 15)]), np.arange(100) * 0.01),
     "short": (np.array([_rounds(9, 5)] * 2), np.arange(9) * 0.01),
     "very short": (np.array([_rounds(5, 5)] * 2), np.arange(5) * 0.01),
     "seldom seen": _with_a_seldom_seen_point(),

@@ -19,8 +19,8 @@ from carom.recordings.observations import Observations
 class Shape(NamedTuple):
     """Polynomials of an `order` through the last samples, of which at least `least` are needed and `reach` are taken.
 
-    A kink is missed by more than `jump` times what the two samples that were foretold before it were. Samples behind a
-    step that is longer than `gap` typical ones are not foretold.
+    A kink is missed by more than `jump` times what the two samples were that were foretold before it, if any were since
+    the last. Samples behind a step that is longer than `gap` typical ones are not foretold.
     """
 
     order: int
@@ -263,8 +263,8 @@ def _one_way(missed: Float[np.ndarray, "M T 2"], shape: Shape) -> list[int]:
         if np.isinf(next_two[0]):  # behind a gap
             k, usual = k + 1, []
             continue
-        # Of bent motion the first sample says how well it is foretold; what hits it there is seen from behind.
-        before = max(usual[-2:], default=np.inf if shape.jump else 0.0)
+        # A kink too many makes windows shorter; one that is missed, right after another, leads them astray.
+        before = max(usual[-2:], default=0.0)
         if (next_two > DOUBT).all() and next_two[0] > shape.jump * before:
             found.append(k - 1)
             begin, k, usual = k, k + shape.least, []
