@@ -1,5 +1,7 @@
 """A step is the same in every frame, size, unit and labelling; far bodies and the order of bodies change nothing."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,14 +46,8 @@ def _steps(name, model):
     return jax.jit(jax.vmap(one, (0, 0, None)))
 
 
-def _cases():
-    for name in SCENES:
-        for model in MODELS:
-            yield name, model
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "model"), list(_cases()))
+@pytest.mark.parametrize(("name", "model"), list(itertools.product(SCENES, MODELS)))
 def test_a_step_is_the_same_in_every_frame_and_unit(name, model):
     """To 1e-9 of the speeds; 1e-7 where contacts are redundant, whose impulses are found to the root of rounding.
 
