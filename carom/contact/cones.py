@@ -33,7 +33,7 @@ from carom.contact.cone_algebra import (
     scale,
 )
 from carom.contact.interior_point import interior_point
-from carom.contact.least_norm import least_norm
+from carom.contact.least_norm import least_norm, may_be_redundant, polished
 from carom.contact.selection import selected
 
 # --- The method -------------------------------------------------------------------------------------------------
@@ -119,7 +119,14 @@ def _solve_block(A, v, friction, lower, reference, settings: ConeSettings, sensi
     else:
         out = _proximal_point(problem, scales, settings)
         if settings.least_norm and settings.smoothing == 0 and v.dtype == jnp.float64:
-            out = _of_least_norm(problem, scales, settings, out)
+            choice = _of_least_norm(problem, scales, settings, out.y, out.residual)
+            out = out._replace(
+                y=choice.y,
+                residual=choice.residual,
+                # It solves the regularised problem around z.
+                regular=jnp.where(choice.chosen, choice.y, out.regular),
+                center=jnp.where(choice.chosen, choice.z, out.center),
+            )
         matrix = _last_matrix(problem, scales, settings, out) if sensitivity else None
     nan = jnp.where(finite, 0, jnp.nan).astype(v.dtype)
     solution = _Internal(
@@ -236,8 +243,20 @@ def _proximal_point(problem: Problem, scales: Scales, settings: ConeSettings) ->
     return jax.lax.while_loop(keep_going, body, first)
 
 
-def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, found: _Solved) -> _Solved:
-    """The same velocities by the impulse of least norm, to rounding: the diagonal selects it to rounding over delta."""
+_POLISHES = 3
+
+
+class _Choice(NamedTuple):
+    """Of many impulses that give the same velocities one: `z`, which it is the projection of, where it is `chosen`."""
+
+    y: Float[Array, "K d B"]
+    z: Float[Array, "K d B"]
+    residual: Float[Array, " B"]
+    chosen: Bool[Array, " B"]
+
+
+def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, y: Array, residual: Array) -> _Choice:
+    """The solution without a diagonal, of least norm to rounding: the diagonal selects it to rounding over delta."""
     k, d, batch = problem.q.shape
     # From S of the program, with its friction, to a scale for normal and tangents alike.
     ways = jnp.concatenate([jnp.ones_like(scales.mu)[:, None], jnp.repeat(scales.mu[:, None], d - 1, axis=1)], axis=1)
@@ -246,19 +265,37 @@ def _of_least_norm(problem: Problem, scales: Scales, settings: ConeSettings, fou
     eye = jnp.eye(k * d, dtype=over.dtype)[..., None]
     plain = problem.Q - scales.regularization.reshape(k * d, 1, batch) * eye
     Q, q = rows[:, None] * plain * rows, over * problem.q
-    u = over * matvec(plain, found.y) + q
-    least = least_norm(Q, q, u, ways * found.y, scales.mu, jnp.maximum(problem.lower, 0), lifts=True)
-    y = over * least.y
-    residual = residual_of(problem, y, scales.regularization)
-    takes = residual <= jnp.maximum(_wanted(settings), found.residual)
-    chosen = least.found & takes
-    return found._replace(
-        y=jnp.where(takes, y, found.y),
-        residual=jnp.where(takes, residual, found.residual),
-        # It solves the regularised problem around z.
-        regular=jnp.where(chosen, y, found.regular),
-        center=jnp.where(chosen, jnp.where(least.held, over * least.z, y), found.center),
+    bound = jnp.maximum(problem.lower, 0)
+
+    def polish(_, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        y, residual = best
+        better = over * polished(Q, q, over * matvec(plain, y) + q, ways * y, scales.mu, bound)
+        missed = residual_of(problem, better, scales.regularization)
+        return jnp.where(missed < residual, better, y), jnp.where(missed < residual, missed, residual)
+
+    y, residual = jax.lax.fori_loop(0, _POLISHES, polish, (y, residual))
+    u = over * matvec(plain, y) + q
+    least = least_norm(Q, q, u, ways * y, scales.mu, bound, lifts=True)
+    found = over * least.y
+    new = residual_of(problem, found, scales.regularization)
+    takes = new <= jnp.maximum(_wanted(settings), residual)
+    return _Choice(
+        jnp.where(takes, found, y),
+        jnp.where(least.held, over * least.z, found),
+        jnp.where(takes, new, residual),
+        least.found & takes,
     )
+
+
+def _choose_block(A, v, friction, lower, reference, impulse, residual, settings: ConeSettings) -> tuple[Array, Array]:
+    """Impulses of least norm, and their residuals, of solutions that the short way has found, batch first."""
+    batch, k, d = v.shape
+    A, v, reference, impulse = (jnp.moveaxis(x, 0, -1) for x in (A.reshape(batch, k, d, k, d), v, reference, impulse))
+    problem, scales = scale(A, v, friction.T, lower.T, reference, settings.diagonal)
+    size = scales.S * scales.unit
+    y = jnp.where(size > 0, impulse / jnp.where(size > 0, size, 1), 0)
+    choice = _of_least_norm(problem, scales, settings, y, residual)
+    return jnp.moveaxis(size * choice.y, -1, 0), choice.residual
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------
@@ -297,12 +334,22 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
     forms = [(has_short_way, *form) for form in by_size(used, k)]
     if has_short_way:
         forms.append((False, k, used > 0))
+    long = jnp.zeros(batch, bool)
     for short, size, chosen in forms:
         m = size * d
         arrays = (A[:, :m, :m], v[:, :size], friction[:, :size], lower[:, :size], reference[:, :size])
         missing = chosen & ~(out[0].residual <= _wanted(settings))
+        long = missing & (not short)
         solve = functools.partial(_solve_block, settings=settings, sensitivity=sensitivity, short=short)
         out = solve_chosen(solve, arrays, missing, _block_size(m, short), out)
+    if has_short_way and settings.least_norm and k > 1:
+        # Of what the short way has found the diagonal has selected the impulse, to rounding over delta.
+        none = jnp.zeros(batch, bool)
+        chosen = jax.lax.cond(jnp.any(used > 1), lambda: may_be_redundant(A, k) & (used > 1) & ~long, lambda: none)
+        solution, choose = out[0], functools.partial(_choose_block, settings=settings)
+        arrays = (A, v, friction, lower, reference, solution.impulse, solution.residual)
+        impulse, residual = solve_chosen(choose, arrays, chosen, LONG_BLOCK[6], (solution.impulse, solution.residual))
+        out = (solution._replace(impulse=impulse, residual=residual), out[1])
     return out
 
 

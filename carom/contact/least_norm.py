@@ -8,7 +8,7 @@ and a plane,
     open        y_n = lower,                                    u_n > 0
     closed      y_n >= lower,                                   u_n = 0
     sticking    |y_t| <= mu y_n,                                u_t = 0
-    sliding     y_t = -mu y_n u_t / |u_t|
+    sliding     y_t = -mu y_n u_t / |u_t|                       (of a convex program: u_n = mu |u_t|)
 
 The one of least norm in both, the projection of zero, is unique. With `Q` and `y` scaled by each contact's mobility the
 norm is an energy, which knows neither frame nor unit; and nothing hangs on how a solution was found. (But in 3D, where
@@ -40,6 +40,10 @@ _REGULAR = 1e-6
 """Matrices whose pivots are all above this share of their diagonals have none."""
 _STILL = 1e-7
 """Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
+_SLOW = 0.01
+"""Where the impulse is at the edge of its cone, velocities above this share of those are sliding."""
+_ROUNDING = 1e-13
+"""Curvatures below this share of the largest are rounding."""
 _STEPS = 80
 _PATIENCE = 12
 """Steps without one that is better by a tenth after which a search ends: modes that nothing can have, or rounding."""
@@ -124,12 +128,42 @@ def _held(u: Array, y: Array, mu: Array, lower: Array, *, lifts: bool) -> tuple[
     speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
     still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
     slides = speed > still
+    if lifts:
+        # Programs are solved better than that: a contact slides if it is nearer to the edge of its cone than to rest.
+        slides = slides | (speed > jnp.maximum(mu * y[:, 0] - jnp.sqrt(dot(y[:, 1:], y[:, 1:])), _SLOW * still))
     closed = u[:, 0] - (mu * speed if lifts else 0) <= still
     way = -u[:, 1:] / jnp.where(slides, speed, 1)[:, None]
+    if lifts:
+        # Where it slides slowly, its friction tells the way better than its velocity.
+        push = jnp.sqrt(dot(y[:, 1:], y[:, 1:]))
+        way = jnp.where((push > speed)[:, None], y[:, 1:] / jnp.where(push > speed, push, 1)[:, None], way)
     # What is pushed harder than it needs has friction, too.
     tangents = ((closed | (lower > 0)) & (mu > 0) & (lifts | ~slides))[:, None]
     rows = jnp.concatenate([closed[:, None], jnp.broadcast_to(tangents, y[:, 1:].shape)], axis=1)
     return Allowed(mu, lower, closed, slides, way), rows
+
+
+def _parts(allowed: Allowed, t: Float[Array, "K t B"]) -> tuple[Float[Array, "K t B"], Float[Array, "K t B"]]:
+    """Of tangents what is across the way of sliding, all of it where a contact sticks; and `mu` along that way."""
+    way = jnp.where(allowed.slides[:, None], allowed.way, 0)
+    return t - way * dot(way, t)[:, None], allowed.mu[:, None] * way
+
+
+def _of_program(
+    allowed: Allowed, Q: Float[Array, "n n B"], q: Float[Array, "K d B"]
+) -> tuple[Float[Array, "n n B"], Float[Array, "K d B"]]:
+    """The rows of the plane, and what they are to be, of a convex program: a contact that slides lifts by it.
+
+    `u_n + mu u_t way = 0` and no velocity across: for these no velocity need be known.
+    """
+    k, d, batch = q.shape
+
+    def turned(x: Float[Array, "K d B"]) -> Float[Array, "K d B"]:
+        across, along = _parts(allowed, x[:, 1:])
+        return jnp.concatenate([x[:, :1] + dot(along, x[:, 1:])[:, None], across], axis=1)
+
+    rows = jax.vmap(turned, in_axes=2, out_axes=2)(Q.reshape(k, d, k * d, batch))
+    return rows.reshape(k * d, k * d, batch), -turned(q)
 
 
 class Least(NamedTuple):
@@ -137,7 +171,7 @@ class Least(NamedTuple):
 
     y: Float[Array, "K d B"]
     z: Float[Array, "K d B"]  # y = P(z),
-    w: Float[Array, "K d B"]  # z = (E Q)^T w
+    w: Float[Array, "K d B"]  # z = Q w, but for rows that are not in E
     V: Float[Array, "B n n"]
     inverse: Float[Array, "B n n"]  # V S^-1 U^T, with columns that are no row of E zero
     held: Bool[Array, "K d B"]  # rows of E
@@ -176,6 +210,44 @@ def project(allowed: Allowed, z: Float[Array, "K d B"]) -> tuple[Float[Array, "K
     return y, jnp.concatenate([top, jnp.concatenate([lifts[:, :, None], moves], axis=2)], axis=1)
 
 
+def polished(
+    Q: Float[Array, "n n B"],
+    q: Float[Array, "K d B"],
+    u: Float[Array, "K d B"],
+    y: Float[Array, "K d B"],
+    mu: Float[Array, "K B"],
+    lower: Float[Array, "K B"],
+) -> Float[Array, "K d B"]:
+    """A nearly solved convex program by the equations of its modes: `G^T (Q G a + q) = 0` for impulses `G a`.
+
+    A column of G is what a contact's impulse can change: all of it where it sticks, `(1, mu way)` where it slides.
+    Where contacts are jammed, small residuals leave velocities that are not small: their equations, without a diagonal,
+    tell them to rounding. The part of the impulse that no equation tells stays as it is.
+    """
+    k, d, batch = y.shape
+    speed, push = (jnp.sqrt(dot(part[:, 1:], part[:, 1:])) for part in (u, y))
+    # Of what is at an edge and what leaves it the smaller is zero.
+    slides = speed > mu * y[:, 0] - push
+    closed = y[:, 0] - lower >= u[:, 0] - mu * jnp.where(slides, speed, 0)
+    sticks = jnp.broadcast_to((~slides & (mu > 0) & (closed | (lower > 0)))[:, None], y[:, 1:].shape)
+    normal = jnp.where(closed, y[:, 0], lower)
+    along = jnp.where(slides, mu / jnp.where(push > 0, push, 1), 0)[:, None] * y[:, 1:]
+    y = jnp.concatenate([normal[:, None], jnp.where(sticks, y[:, 1:], along * normal[:, None])], axis=1)
+    blocks = jnp.zeros((k, d, d, batch), y.dtype)
+    blocks = blocks.at[:, 0, 0].set(jnp.where(closed, 1, 0))
+    blocks = blocks.at[:, 1:, 0].set(jnp.where(closed[:, None], along, 0))
+    blocks = blocks.at[:, jnp.arange(1, d), jnp.arange(1, d)].set(jnp.where(sticks, 1, 0))
+    G, matrix = block_diagonal(blocks), jnp.moveaxis(Q, -1, 0)
+    values, vectors = jnp.linalg.eigh(jnp.swapaxes(G, 1, 2) @ matrix @ G)
+    over = jnp.where(values > _ROUNDING * values[:, -1:], 1 / jnp.asarray(jnp.where(values > 0, values, 1)), 0)
+    ways = G @ vectors
+    f, known = (jnp.moveaxis(part, -1, 0).reshape(batch, k * d) for part in (y, q))
+    for _ in range(2):
+        missed = jnp.einsum("bij,bi->bj", ways, jnp.einsum("bij,bj->bi", matrix, f) + known)
+        f = f - jnp.einsum("bij,bj->bi", ways, over * missed)
+    return jnp.moveaxis(f.reshape(batch, k, d), 0, -1)
+
+
 def block_diagonal(blocks: Float[Array, "K d d B"]) -> Float[Array, "B n n"]:
     """One matrix of those of the contacts."""
     k, d, _, batch = blocks.shape
@@ -202,18 +274,22 @@ def least_norm(
     """
     k, d, batch = y.shape
     allowed, held = _held(u, y, mu, lower, lifts=lifts)
-    slides = allowed.slides
 
     def first(x: Array) -> Array:
         return jnp.moveaxis(x.reshape(k * d, batch), -1, 0)
 
     rows = first(held)
-    wanted = first(jnp.where(slides[:, None] & lifts, u, 0) - q)
-    left, values, right = jnp.linalg.svd(jnp.where(rows[..., None], jnp.moveaxis(Q, -1, 0), 0))
+    matrix, wanted = _of_program(allowed, Q, q) if lifts else (Q, -q)
+    wanted = first(wanted)
+    left, values, right = jnp.linalg.svd(jnp.where(rows[..., None], jnp.moveaxis(matrix, -1, 0), 0))
     counts = values > _SINGULAR * values[:, :1]
     V = jnp.where(counts[:, None], jnp.swapaxes(right, 1, 2), 0)
     b = (jnp.einsum("bij,bi->bj", left, jnp.where(rows, wanted, 0)) / jnp.where(counts, values, jnp.inf)).T
-    singular = jnp.sum(counts, axis=1) < jnp.sum(rows, axis=1) if lifts else are_redundant(Q, u, y, mu, lower)
+    if lifts:
+        acting = rows[:, :, None] & rows[:, None]
+        singular = _is_singular(jnp.where(acting, jnp.moveaxis(Q, -1, 0), 0))
+    else:
+        singular = are_redundant(Q, u, y, mu, lower)
     size = jnp.maximum(jnp.max(jnp.abs(b), axis=0), 1)
 
     lengths, ridges = jnp.array(_LENGTHS, y.dtype), jnp.array(_RIDGES, y.dtype).T
@@ -264,4 +340,7 @@ def least_norm(
     inverse = jnp.where(rows[:, None], jnp.einsum("bij,bj,bkj->bik", V, over, left), 0)
     z = jnp.einsum("bij,jb->ib", V, end.a).reshape(k, d, batch)
     w = jnp.einsum("bij,jb->ib", left, end.a * over.T).reshape(k, d, batch)
+    if lifts:
+        across, along = _parts(allowed, w[:, 1:])
+        w = jnp.concatenate([w[:, :1], across + along * w[:, :1]], axis=1)
     return Least(jnp.where(found, end.P, y), z, w, V, inverse, held, allowed, singular, found)
