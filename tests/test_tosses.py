@@ -17,28 +17,36 @@ from systems import ball_on_floor, refused
 import carom
 from carom.cli.main import main
 from carom.cli.systems import Chosen
-from carom.cli.tosses import _warn_if_far_off, nominal_width, touching_height
+from carom.cli.tosses import explains, nominal_width, touching_height
 from carom.cli.view import View
 from carom.learning.estimation.protocols import body_points, box_points, paired_difference, protocol_starts, toss_errors
-from carom.learning.estimation.toss_config import CENTER, TossConfig, read_values, toss_quantities, with_values
-from carom.learning.estimation.tosses import choose_segments, learn_tosses, predict_tosses, prepared
+from carom.learning.estimation.toss_config import STEPS, TossConfig, search_steps, tossed_names
+from carom.learning.estimation.tosses import choose_segments, learn_tosses, predict_tosses
 from carom.learning.run import RunFolder
+from carom.learning.unknowns.quantities import Learned
 from carom.mechanics.bodies import embed_pose, embed_velocity, recover_velocity
 from carom.recordings.poses import poses_of
 
 DT, WIDTH = 1 / 148, 0.1024
 HEIGHT = np.sqrt(3) / 2 * WIDTH
 """Half of the diagonal."""
-NAMES = ("inertia", "friction", "restitution")
-CONFIG = TossConfig(
-    learn_of_toss=NAMES,
-    horizons=(8,),
-    segments=200,
-    toss_rounds=4,
-    evaluations=0,
-    toss_samples=50,
-    toss_contact_model=None,
-)
+NAMES = ("inertia:0", "friction:0", "restitution:0")
+CENTER = tuple(f"center_of_mass:0:{axis}" for axis in "xyz")
+CONFIG = TossConfig(horizons=(8,), segments=200, toss_rounds=4, evaluations=0, toss_samples=50)
+
+
+def changed(system, values):
+    """The system with other values of quantities, by their names."""
+    for name, value in values.items():
+        (quantity,) = Learned.chosen(system, [name]).quantities
+        system = quantity.put(system, jnp.asarray(value))
+    return system
+
+
+def values_of(system, names):
+    """Values by name."""
+    learned = Learned.chosen(system, names)
+    return dict(zip(learned.names, np.asarray(learned.physical(learned.free())).tolist(), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -60,21 +68,19 @@ def tosses(cube_tosses):
 
 @pytest.fixture(scope="module")
 def moved(cube):
-    return with_values(cube, toss_quantities(cube, NAMES), jnp.asarray([7e-4, 0.25, 0.25]))
+    return changed(cube, dict(zip(NAMES, (7e-4, 0.25, 0.25), strict=True)))
 
 
 @pytest.mark.slow
 def test_segments_recover_what_noisy_tosses_were_made_with(cube, tosses, moved):
-    learned = toss_quantities(cube, NAMES)
-    truth = read_values(cube, learned)
-    system, report = learn_tosses(moved, tosses, CONFIG, progress=False)
-    for name, true in zip(NAMES, truth, strict=True):
+    system, report = learn_tosses(moved, tosses, NAMES, CONFIG, progress=False)
+    for name, true in values_of(cube, NAMES).items():
         found = report.estimates[name]
         assert found.standard_error is not None
         assert 0 < found.standard_error < 0.1 * max(abs(true), 0.1)
         assert abs(found.value - true) < 5 * found.standard_error  # four sessions alone
         assert abs(found.value - true) < 0.05 * true
-    assert np.allclose(read_values(system, learned), [e.value for e in report.estimates.values()])
+    assert values_of(system, NAMES) == pytest.approx({name: one.value for name, one in report.estimates.items()})
     assert report.tosses == 60
     start_position, start_rotation = errors_of(moved, tosses)
     assert report.position < 0.3 * start_position
@@ -90,7 +96,7 @@ def errors_of(system, recording):
 def test_a_search_that_was_stopped_goes_on_without_computing_again(tosses, moved, tmp_path):
     config = dataclasses.replace(CONFIG, horizons=(), evaluations=9)
     whole = RunFolder.create(tmp_path / "whole", {})
-    _, expected = learn_tosses(moved, tosses, config, run=whole, progress=False)
+    _, expected = learn_tosses(moved, tosses, NAMES, config, run=whole, progress=False)
 
     class StoppedError(Exception):
         pass
@@ -102,9 +108,9 @@ def test_a_search_that_was_stopped_goes_on_without_computing_again(tosses, moved
                 raise StoppedError
 
     with pytest.raises(StoppedError):
-        learn_tosses(moved, tosses, config, run=Stopping.create(tmp_path / "part", {}), progress=False)
+        learn_tosses(moved, tosses, NAMES, config, run=Stopping.create(tmp_path / "part", {}), progress=False)
     again = RunFolder.open(tmp_path / "part")
-    _, report = learn_tosses(moved, tosses, config, run=again, progress=False)
+    _, report = learn_tosses(moved, tosses, NAMES, config, run=again, progress=False)
     assert [row["loss"] for row in again.metrics()] == [row["loss"] for row in whole.metrics()]
     assert report.estimates == expected.estimates
     assert report.evaluations == 9
@@ -122,31 +128,17 @@ def test_segments_start_in_flight_before_an_impact(cube, tosses):
     assert all(closed[k, s + 2 : s + 6].any() for k, s in steps)
 
 
-def test_values_are_read_as_they_were_written(cube):
-    system = prepared(cube, TossConfig(learn_of_toss=("restitution_loss", "table_tilt_x", "table_height", "gravity")))
-    names = ("restitution_loss", "friction_loss", "table_tilt_x", "table_tilt_y", "table_height", "gravity", *CENTER)
-    values = np.array([0.3, 0.1, 0.01, -0.02, 1e-3, 9.7, 1e-3, -2e-3, 6e-3])
-    learned = toss_quantities(system, names)
-    assert [each.name for each in learned] == list(names)
-    changed = with_values(system, learned, jnp.asarray(values))
-    assert np.allclose(changed.contacts[0].center, -values[-3:])
-    assert np.allclose(read_values(changed, learned), values, rtol=1e-12)
-    assert np.isclose(jnp.linalg.norm(changed.contacts[0].normal), 1)
-    others = toss_quantities(system, ("half_width", "inertia"))
-    assert np.allclose(read_values(changed, others), read_values(cube, others))
-
-
-def test_all_of_the_registry_can_be_learned_of_tosses(cube):
-    system = prepared(cube, TossConfig())
-    learned = toss_quantities(system, ("friction", "half_widths", "gravity:z"))
-    names = ["friction", "half_widths:0:x", "half_widths:0:y", "half_widths:0:z", "gravity:z"]
-    assert [each.name for each in learned] == names
-    assert np.allclose(read_values(system, learned), [0.18, 0.0512, 0.0512, 0.0512, -9.61])
-    assert np.allclose([each.step for each in learned], [0.03, *[0.01 * 0.0512] * 3, 0.1])  # 1 % of a length
-    with refused("half_widths:0:x is a part of half_width:0"):
-        toss_quantities(system, ("half_width", "half_widths"))
-    with refused("half_widht"):
-        toss_quantities(system, ("half_widht",))
+def test_what_is_learned_of_a_toss_if_nothing_is_said(cube):
+    """Losses belong to Coulomb's law; a step of the search is one in the unit of each quantity."""
+    names = ("half_width", "corner_radius", "inertia", "center_of_mass", "friction:0", "restitution:0")
+    assert tossed_names(cube) == names
+    system = cube.with_contact_model("coulomb")
+    assert tossed_names(system) == (*names, "friction_loss", "restitution_loss")
+    learned = Learned.chosen(system, tossed_names(system))
+    theta = learned.free()
+    for k, (quantity, step) in enumerate(zip(learned.quantities, search_steps(learned), strict=True)):
+        there = learned.physical(theta.at[k].add(1e-3 * step))[k] - learned.physical(theta)[k]
+        assert float(there) == pytest.approx(1e-3 * STEPS[quantity.label.kind], rel=1e-3)
 
 
 def box_on_two_planes() -> carom.System:
@@ -164,19 +156,24 @@ def box_on_two_planes() -> carom.System:
 
 
 def test_a_box_keeps_its_proportions_and_a_wall_its_properties():
-    box, names = box_on_two_planes(), ("half_width", "inertia", "friction", "restitution")
-    learned = toss_quantities(box, names)
-    values = read_values(box, learned)
-    assert np.allclose(values, [0.035, 4e-4, 0.2, 0.1])  # mean half width, mean moment of inertia, those of the table
-    same = with_values(box, learned, jnp.asarray(values))
-    assert np.allclose(same.contacts[0].half_widths, (0.06, 0.03, 0.015), rtol=1e-12)
-    changed = with_values(box, learned, jnp.asarray([0.07, 8e-4, 0.3, 0.4]))
-    for contact in changed.contacts:  # one box, whatever it meets
+    box = box_on_two_planes()
+    assert tossed_names(box)[:6] == (
+        "half_width",
+        "corner_radius",
+        "inertia",
+        "center_of_mass",
+        "friction:1",
+        "restitution:1",
+    )
+    names = ("half_width:0", "inertia:0", "friction:1", "restitution:1")
+    values = values_of(box, names)
+    assert list(values.values()) == pytest.approx([4e-4, 0.2, 0.1, 0.035])  # in the order of the registry
+    other = changed(box, {"half_width:0": 0.07, "inertia:0": 8e-4, "friction:1": 0.3, "restitution:1": 0.4})
+    for contact in other.contacts:  # one box, whatever it meets
         assert np.allclose(contact.half_widths, (0.12, 0.06, 0.03))
-    assert np.allclose(changed.bodies[0].moments, (2e-4, 4e-4, 6e-4))
-    assert np.allclose(changed.friction, (0.5, 0.3))
-    assert np.allclose(changed.restitution, (0.9, 0.4))
-    assert np.allclose(read_values(changed, learned), [0.07, 8e-4, 0.3, 0.4])
+    assert np.allclose(other.bodies[0].moments, (2e-4, 4e-4, 6e-4))
+    assert np.allclose(other.friction, (0.5, 0.3))
+    assert np.allclose(other.restitution, (0.9, 0.4))
 
 
 def test_a_box_is_measured_from_where_its_corners_can_touch():
@@ -191,14 +188,16 @@ def test_a_box_is_measured_from_where_its_corners_can_touch():
 
 def test_other_systems_and_wrong_settings_are_refused(cube, tosses):
     with refused("one rigid body with a CornerPlane"):
-        learn_tosses(ball_on_floor(), tosses, CONFIG, progress=False)
-    with refused("learn_of_toss must name something, such as half_width"):
-        TossConfig(learn_of_toss=()).check()
+        learn_tosses(ball_on_floor(), tosses, NAMES, CONFIG, progress=False)
+    with refused("learn must name something, such as half_width"):
+        learn_tosses(cube, tosses, (), CONFIG, progress=False)
     with refused("'mass' is nothing that can be learned of this system"):
-        learn_tosses(cube, tosses, dataclasses.replace(CONFIG, learn_of_toss=("mass",)), progress=False)
+        learn_tosses(cube, tosses, ("mass",), CONFIG, progress=False)
+    with refused("'friction_loss' is nothing that can be learned of this system (it belongs to the contact model coul"):
+        learn_tosses(cube, tosses, ("friction_loss",), CONFIG, progress=False)
     with refused("too few for 3 quantities"):
         short = carom.Recording.of(tosses.x[:1, :12], tosses.v[:1, :12], dt=DT)
-        learn_tosses(cube, short, CONFIG, progress=False)
+        learn_tosses(cube, short, NAMES, CONFIG, progress=False)
 
 
 # --- protocols ----------------------------------------------------------------------------------------------------
@@ -223,7 +222,7 @@ def test_errors_are_what_was_done_to_the_truth(cube, tosses):
 
 def test_recordings_are_of_the_centre_of_the_box(cube):
     center = np.array([1e-3, -2e-3, 5e-3])
-    system = with_values(cube, toss_quantities(cube, CENTER), -jnp.asarray(center))
+    system = changed(cube, dict(zip(CENTER, -center, strict=True)))
     rotation = jnp.asarray(Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix())
     mass, spin = jnp.array([0.1, 0.2, 0.3]), jnp.array([1.0, -2.0, 3.0])
     x, v = embed_pose(mass, rotation), embed_velocity(rotation, jnp.array([0.5, 0.0, -1.0]), spin)
@@ -240,7 +239,7 @@ def test_predictions_of_tosses_that_are_far_off_are_called_so(tosses):
     way = np.linalg.norm(tosses.x[:, :, 0] - tosses.x[:, :1, 0], axis=-1).mean(axis=1)
     for share, expected in ((0.09, False), (0.11, True)):
         text = io.StringIO()
-        _warn_if_far_off(Console(file=text), tosses, share * way)
+        assert explains(Console(file=text), tosses, share * way) != expected
         assert ("does not explain the data" in text.getvalue()) == expected
 
 
@@ -351,11 +350,16 @@ def test_from_a_pose_file_to_a_table(tosses, tmp_path, monkeypatch, capsys):
         "--toss-samples",
         "40",
     ]
-    main(["learn", "cube", "--data", "lab-trajectories.h5", "--out", "run", "--learn-of-toss", "friction", *options])
+    main(["learn", "cube", "--data", "lab-trajectories.h5", "--out", "run", "--learn", "friction", *options])
     out = capsys.readouterr().out
     assert "Protocol A" in out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert set(report["learned"]["estimates"]) == {"friction"}
+    assert set(report["learned"]["estimates"]) == {"friction:0"}
+    (estimate,) = report["estimates"]
+    assert (estimate["name"], estimate["of"], estimate["unit"]) == ("friction:0", "body 0 and plane 0", "")
+    assert estimate["lower"] < estimate["value"] < estimate["upper"]
+    assert estimate["verdict"] == ("identified" if report["fit"]["explained"] else "misfit")
+    assert report["fit"]["impact_rule"] == "event"
     main(["evaluate", "run", "--protocol", "B", "--data", "lab-trajectories.h5", "--against", "run"])
     assert "bootstrap over 2 sessions" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "run" / "toss_errors_B.csv").read_text().splitlines()))
@@ -386,7 +390,7 @@ def test_tosses_of_an_own_system_are_learned_measured_and_seen_by_one_rule(tosse
     (tmp_path / "mine.py").write_text(OWN)
     for name, part in (("train", tosses.select(slice(8))), ("test", tosses.select(slice(8, 13)))):
         carom.save_recording(f"{name}.h5", dataclasses.replace(part, task=""))
-    words = ["learn", "mine.py", "--data", "train.h5", "--test", "test.h5", "--learn-of-toss", "friction"]
+    words = ["learn", "mine.py", "--data", "train.h5", "--test", "test.h5", "--learn", "friction"]
     words += ["--horizons", "--evaluations", "1", "--toss-samples", "40", "--substeps", "2"]
     main(words)
     assert "Learning mine.py from 8 recorded tosses into runs/mine-tosses" in capsys.readouterr().out

@@ -25,7 +25,8 @@ from carom.contact.impulses import contact_model_of
 from carom.errors import CaromError
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.dataset import Dataset, hold_out, in_pieces, sessions_of
-from carom.learning.estimation.tosses import TossConfig, can_learn_tosses
+from carom.learning.estimation.toss_config import TossConfig, tossed_names
+from carom.learning.estimation.tosses import can_learn_tosses
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
@@ -134,8 +135,12 @@ class Learn:
         if self._is_for_estimator(chosen):
             self._run_estimator(console, chosen)
             return
-        self.config.check()
-        self.config.prepare(truth)
+        tosses = self.data is not None and can_learn_tosses(truth)
+        # Names of what is learned of tosses are those of the registry.
+        config = dataclasses.replace(self.config, learn=LearnConfig.learn) if tosses else self.config
+        config.check()
+        if not tosses:
+            config.prepare(truth)
         require(
             self.data is not None or not chosen.own,
             f"data is needed for {chosen.name}: give a trajectory file to learn from, --data FILE.",
@@ -150,7 +155,7 @@ class Learn:
             f"--data-noise is for simulated data; it was {self.data_noise}, and --data {str(self.data)!r}.",
         )
         require(self.trajectories >= 8, f"--trajectories must be at least 8; it was {self.trajectories}.")
-        if self.data is not None and can_learn_tosses(truth):
+        if tosses:
             self._run_tosses(console, chosen)
             return
         if not is_first():
@@ -186,11 +191,15 @@ class Learn:
         """Recordings of a tossed body are noisy poses: they have a fit of their own."""
         self.tosses.check()
         require(self.process_count == 1, f"--process-count must be 1 for recorded tosses; it was {self.process_count}.")
+        # Coulomb's law by default, which knows what fast impacts lose.
+        config = dataclasses.replace(self.config, contact_model=self.config.contact_model or "coulomb")
+        chosen = dataclasses.replace(chosen, system=config.prepare(chosen.system))
+        names = tossed_names(chosen.system) if config.learn == LearnConfig.learn else config.learn
         folder = RunFolder.choose(self.out, f"{chosen.stem}-tosses", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
         train, test = self._toss_data(console, chosen)
-        settings = {**self._description(chosen), "tosses": dataclasses.asdict(self.tosses)}
+        settings = {**self._description(chosen), "learn": names, "tosses": dataclasses.asdict(self.tosses)}
         if self.resume:
             run = RunFolder.open(folder)
             run.check_same(settings)
@@ -205,7 +214,7 @@ class Learn:
             soft_wrap=True,
             highlight=False,
         )
-        learn_and_measure(console, run, chosen, train, test, self.tosses)
+        learn_and_measure(console, run, chosen, train, test, names, self.tosses, self.config.seed)
 
     def _is_for_estimator(self, chosen: Chosen) -> bool:
         if can_learn_tosses(chosen.system) or self.config.model not in ("clnn", "chnn"):

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +29,25 @@ from carom.learning.estimation.protocols import (
     protocol_starts,
     toss_errors,
 )
-from carom.learning.estimation.toss_config import CENTER, TossConfig
+from carom.learning.estimation.toss_config import TossConfig
 from carom.learning.estimation.tosses import COMPENSATION, IMPACT, TossReport, learn_tosses, predict_tosses
+from carom.learning.estimation.verdict import Estimate
 from carom.learning.evaluate import FAR_OFF
 from carom.learning.model_file import load_model_into, save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, RunFolder
 from carom.recordings.recording import Recording
 from carom.system import System
 
-PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": 8.1e-4, **dict.fromkeys(CENTER, 0.0)}
+PUBLISHED = {
+    "friction:0": 0.18,
+    "restitution:0": 0.125,
+    "inertia:0": 8.1e-4,
+    **{f"center_of_mass:0:{axis}": 0.0 for axis in "xyz"},
+}
 """Of the acrylic cube (Pfrommer, Halm, Posa, CoRL 2020), with its mass in the middle."""
+
+WIDTH_95 = 1.96
+"""Half of a 95 % interval, in standard errors."""
 
 NOMINAL = 0.1048
 """Width of that cube (m)."""
@@ -68,17 +78,42 @@ class LearnedToss:
 
 
 def learn_and_measure(
-    console: Console, run: RunFolder, chosen: Chosen, train: Recording, test: Recording, config: TossConfig
+    console: Console,
+    run: RunFolder,
+    chosen: Chosen,
+    train: Recording,
+    test: Recording,
+    learn: Sequence[str],
+    config: TossConfig,
+    seed: int,
 ) -> None:
     """Learn from `train`, measure on `test` by protocol A, and write all that into the run folder."""
-    system, report = learn_tosses(chosen.system, train, config, run=run)
+    system, report = learn_tosses(chosen.system, train, learn, config, seed=seed, run=run)
     save_model(run.path / MODEL, system, compensation_steps=COMPENSATION, impact=IMPACT)
     console.print(estimate_table(report, chosen.name))
     console.print("Mass is not learned: forces are in proportion to it, so that it drops out of the motion.")
     learned = LearnedToss(run.path.name, system, config.substeps)
     measures = measure(console, run, learned, test, "A", chosen)
-    run.write_json(REPORT, {"learned": dataclasses.asdict(report), "evaluation": measures})
+    told = {**estimates_and_fit(report, explained=measures.pop("explained")), "evaluation": measures}
+    run.write_json(REPORT, {**told, "learned": dataclasses.asdict(report)})
     console.print(f"Done ({report.seconds:.0f} s). Everything is in {run.path}", soft_wrap=True, highlight=False)
+
+
+def estimates_and_fit(report: TossReport, *, explained: bool) -> dict[str, Any]:
+    """What was found as the estimator reports it: `estimates` by the names of quantities, and the `fit`.
+
+    What is fitted is predictions, not errors of recorded numbers (`chi2` is None): where these are far off, or where
+    segments of tosses do not tell a quantity, it is not told.
+    """
+    estimates = []
+    for name, one in report.estimates.items():
+        error = np.nan if one.standard_error is None else one.standard_error
+        verdict = "misfit" if not explained else "not identified" if one.standard_error is None else "identified"
+        half = float(WIDTH_95 * error)
+        ends = one.value - half, one.value + half
+        estimates.append(Estimate(name, one.of, one.value, float(error), *ends, one.unit, verdict, None))
+    fit = {"explained": explained, "chi2": None, "by_channel": {}, "impact_rule": IMPACT}
+    return {"estimates": [dataclasses.asdict(one) for one in estimates], "fit": fit}
 
 
 def nominal_width(chosen: Chosen) -> float:
@@ -122,8 +157,9 @@ def measure(
     data = protocol_starts(recording, protocol, touching_height(chosen), moments_of(system))
     predicted = learned.predict(data)
     errors = toss_errors(system, data, predicted, width)
-    _warn_if_far_off(console, data, errors.position * width / 100)
+    explained = explains(console, data, errors.position * width / 100)
     out: dict[str, Any] = {"protocol": protocol, "tosses": len(errors.position), **errors.summary()}
+    out["explained"] = explained
     shown = {"learned": errors}
     table = Table(title=f"Protocol {protocol}: {len(errors.position)} tosses")
     for column in ("error", "mean", "sd", "median"):
@@ -151,13 +187,14 @@ def measure(
     return out
 
 
-def _warn_if_far_off(console: Console, data: Recording, distance: Float[np.ndarray, " N"]) -> None:
-    """Say where predictions whose centres are off by `distance` (m) do not explain the tosses."""
+def explains(console: Console, data: Recording, distance: Float[np.ndarray, " N"]) -> bool:
+    """Whether predictions whose centres are off by `distance` (m) explain the tosses; says so where they do not."""
     way, _ = pose_errors(np.broadcast_to(data.x[:, :1], data.x.shape), data.x, data.length)
     share = float(np.median(distance / np.maximum(way, 1e-300)))
     if not share <= FAR_OFF:
         why = f"predictions are off by {percent(share)} of the way from the start in the median, above {FAR_OFF:.0%}"
         say_unexplained(console, why)
+    return share <= FAR_OFF
 
 
 def write_errors(path: Path, recording: Recording, errors: TossErrors) -> None:

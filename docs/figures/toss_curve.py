@@ -18,19 +18,20 @@ from carom.atomic import write_whole
 from carom.cli.main import configure_jax
 from carom.cli.tosses import nominal_width
 from carom.learning.estimation.protocols import toss_errors
-from carom.learning.estimation.tosses import TossConfig, learn_tosses, predict_tosses
+from carom.learning.estimation.toss_config import TossConfig
+from carom.learning.estimation.tosses import learn_tosses, predict_tosses
 from carom.view.style import BLUE, VERMILLION, figure_style, new_figure, save_png
 
 SIZES = (4, 8, 16, 32, 64, 128, 256)
 DRAWS = 3
-CONFIG = TossConfig(toss_extras=("friction_loss", "restitution_loss"), evaluations=0, segments=600)
+CONFIG = TossConfig(evaluations=0, segments=600)
 
 
 def measure(train: carom.Recording, val: carom.Recording, size: int, draw: int) -> dict[str, float]:
     """Learn from `size` tosses: mean errors over the other file's, and what was learned."""
     chosen = np.random.default_rng((size, draw)).permutation(train.n_trajectories)[:size]
-    skeleton = carom.task("cube")
-    system, report = learn_tosses(skeleton, train.select(np.sort(chosen)), CONFIG, progress=False)
+    skeleton = carom.task("cube").with_contact_model("coulomb")
+    system, report = learn_tosses(skeleton, train.select(np.sort(chosen)), config=CONFIG, progress=False)
     errors = toss_errors(system, val, predict_tosses(system, val), nominal_width(skeleton))
     values = {name: estimate.value for name, estimate in report.estimates.items()}
     return {

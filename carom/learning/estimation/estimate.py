@@ -212,7 +212,7 @@ def _by_rule(
     longer = longer._replace(start=_starts(short, short.start, longer))
     wide = shooting_of(longer)
     there = wide.at(state.theta, _starts(short, starts, longer))
-    if wide.size(there) > LOST * shooting.size(state):
+    if wide.sizes(there).after > LOST * shooting.sizes(state).after:
         # What grows without bounds has to be right at its start before it says anything of the quantities.
         each = part(0.4, 0.6, "starts of longer windows", len(REDESCENDING * 6))
         there = shoot(wide, there.theta, there.z, REDESCENDING * 6, held=True, each=each)

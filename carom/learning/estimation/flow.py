@@ -17,6 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from carom.learning.estimation.protocols import are_elsewhere, own_points, recorded_points
 from carom.learning.unknowns.quantities import Learned
 from carom.simulation.events import closing_speed, hermite, touching
 from carom.simulation.impact import ImpactRule, Stepper, smooth_flow
@@ -29,6 +30,8 @@ FREE, NEAR = 64, 32
 """Windows that are moved together, without and with contact."""
 PLACES = 4
 """Places on the way of a step at which gaps are looked at, before it is said that none can close."""
+INDEPENDENT = 1e-8
+"""Constraints whose singular values are all above this share of the largest are independent."""
 MARGIN = 0.05
 """Share of what a gap can change within a step by which it must stay open at these places."""
 
@@ -46,27 +49,61 @@ class Hits(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Positions of windows at their times, and the derivatives by the start and by the free numbers."""
+    """Starts of windows, on their constraints, positions at their times, and derivatives by the start and theta."""
 
+    start: Float[np.ndarray, "W 2 n d"]
     x: Float[np.ndarray, "W T R"]
     by_start: Float[np.ndarray, "W T R S"]
     by_theta: Float[np.ndarray, "W T R P"]
     hits: Hits
 
 
-def _with_derivatives(one: Callable, *at: Array):
-    """`one` of arrays, which has something beside, and its derivatives by all numbers of theirs, as one matrix."""
+def _with_derivatives(one: Callable, ways: Float[Array, "S m"], *at: Array):
+    """`one` of arrays, which has something beside, and its derivatives as one matrix: by the first array along `ways`,
+    by all numbers of the others."""
     flat, unravel = ravel_pytree(at)
+    size, m = ways.shape
+    rest = len(flat) - size
+    along = jnp.zeros((m + rest, len(flat)), flat.dtype)
+    along = along.at[:m, :size].set(ways.T).at[m:, size:].set(jnp.eye(rest, dtype=flat.dtype))
 
     def push(t):
         return jax.jvp(lambda flat: one(*unravel(flat)), (flat,), (t,), has_aux=True)
 
-    after, slopes, beside = jax.vmap(push, out_axes=(None, 0, None))(jnp.eye(len(flat), dtype=flat.dtype))
-    return after, jnp.concatenate([part.reshape(len(flat), -1) for part in jax.tree.leaves(slopes)], axis=1).T, beside
+    after, slopes, beside = jax.vmap(push, out_axes=(None, 0, None))(along)
+    return after, jnp.concatenate([part.reshape(len(along), -1) for part in jax.tree.leaves(slopes)], axis=1).T, beside
+
+
+def _ways(system: System, z: Float[Array, "2 n d"], thin: bool) -> Float[Array, "S m"]:
+    """Ways that a state can move: if `thin`, those along its constraints, of unit length and orthogonal; else all."""
+    flat, unravel = ravel_pytree(z)
+    if not thin:
+        return jnp.eye(len(flat), dtype=flat.dtype)
+    held = _ties(system, unravel)(flat)
+    return jnp.linalg.qr(held.T, mode="complete")[0][:, len(held) :]
+
+
+def _ties(system: System, unravel: Callable) -> Callable[[Array], Array]:
+    """Derivatives of the constraints of a state, and of their rates, by it."""
+
+    def missed(flat):
+        z = unravel(flat)
+        return jnp.concatenate(jax.jvp(system.constraints, (z[0],), (z[1],)))
+
+    return jax.jacfwd(missed)
 
 
 @eqx.filter_jit
-def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[Array, " B"], rule):
+def _constrained(learned: Learned, theta, z: Float[Array, "2 n d"]):
+    """Singular values of what holds a state, relative to the largest, and whether theta has a part in that."""
+    flat, unravel = ravel_pytree(z)
+    values = jnp.linalg.svd(_ties(learned.assemble(theta), unravel)(flat), compute_uv=False)
+    moved = jax.jacfwd(lambda theta: learned.assemble(theta).constraints(z[0]))(theta)
+    return values / values[0], jnp.any(moved != 0)
+
+
+@eqx.filter_jit
+def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[Array, " B"], rule, thin: bool):
     system = learned.assemble(theta)
 
     def alone(dt, z, theta):
@@ -75,25 +112,27 @@ def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[A
         return jnp.stack([out.x, out.v]), None
 
     def one(z, dt):
-        after, slopes, _ = _with_derivatives(functools.partial(alone, dt), z, theta)
+        ways = _ways(system, z, thin)
+        after, slopes, _ = _with_derivatives(functools.partial(alone, dt), ways, z, theta)
         if not system.contacts:
-            return after, slopes, jnp.zeros(0, bool)
+            return after, slopes, ways, jnp.zeros(0, bool)
         start, end = (z[0], z[1]), (after[0], after[1])
         fastest, travel = closing_speed(system, start, end) * dt, system.travel()
         shares = jnp.linspace(0, 1, PLACES + 1)
         gaps = jax.vmap(lambda s: system.gaps(hermite(start, end, dt, s * dt)[0]))(shares)
         close = jnp.min(gaps, axis=0) <= MARGIN * fastest + touching(system, z[0])
         far = (fastest > travel) & (travel > 0) & (gaps[0] <= 2 * fastest)
-        return after, slopes, close | far
+        return after, slopes, ways, close | far
 
     return jax.vmap(one)(z, dt)
 
 
 def _segments(
-    learned: Learned, theta, start: Float[Array, "B 2 n d"], dt: Float[Array, " B"], now: Progress, count, rule
+    learned: Learned, theta, start: Float[Array, "B 2 n d"], dt: Float[Array, " B"], now: Progress, count, rule, thin
 ):
-    """The next segments of steps: how far they are then, and the derivatives of that, (x, v, left), by the same and
-    theta. By the rule of steps a step is one segment."""
+    """The next segments of steps: how far they are then, the derivatives of that, (x, v, left), by the state along its
+    ways, what is left and theta, and these ways. By the rule of steps a step is one segment."""
+    system = learned.assemble(theta)
 
     def segment(start, dt, now: Progress, count, z, left, theta):
         system, stepper = learned.assemble(theta), _stepper(learned, dt, rule)
@@ -109,8 +148,10 @@ def _segments(
 
     def one(start, dt, now: Progress, count):
         own = functools.partial(segment, start, dt, now, count)
-        after, slopes, end = _with_derivatives(own, jnp.stack([now.x, now.v]), now.left, theta)
-        return end._replace(x=after[0][0], v=after[0][1]), slopes
+        z = jnp.stack([now.x, now.v])
+        ways = _ways(system, z, thin)
+        after, slopes, end = _with_derivatives(own, ways, z, now.left, theta)
+        return end._replace(x=after[0][0], v=after[0][1]), slopes, ways
 
     return jax.vmap(one)(start, dt, now, count)
 
@@ -131,13 +172,35 @@ def _compiled_segments() -> Callable:
 
 @eqx.filter_jit
 def _starts(learned: Learned, theta, z: Float[Array, "W 2 n d"]):
-    """Starts brought onto the constraints."""
+    """Starts as they were recorded, brought onto the constraints, the same of the system's own points, and derivatives.
 
-    def one(z, theta):
+    These are where the constraints hold: elsewhere steps off these, which nothing tells, would seem to be told.
+    """
+
+    def own(z, theta):
         system = learned.assemble(theta)
-        return jnp.stack(project_state(system.constraints, z[0], z[1], system.inverse_mass_matrix(), steps=3)), None
+        x, v = own_points(system, z)
+        return jnp.stack(project_state(system.constraints, x, v, system.inverse_mass_matrix(), steps=3)), None
 
-    return jax.vmap(lambda z: _with_derivatives(one, z, theta)[:2])(z)
+    def one(z):
+        held = recorded_points(learned.assemble(theta), own(z, theta)[0])
+        return held, *_with_derivatives(own, every, held, theta)[:2]
+
+    every = jnp.eye(z[0].size, dtype=z.dtype)
+    return jax.vmap(one)(z)
+
+
+@eqx.filter_jit
+def _recorded(learned: Learned, theta):
+    """The matrix that makes recorded points of the system's own, and its derivatives by theta."""
+    size = learned.skeleton.n_points * learned.skeleton.dim
+
+    def matrix(theta):
+        system = learned.assemble(theta)
+        points = jnp.eye(size).reshape(size, system.n_points, system.dim)
+        return recorded_points(system, points).reshape(size, size).T
+
+    return matrix(theta), jax.jacfwd(matrix)(theta)
 
 
 def _stepper(learned: Learned, dt: Float[Array, ""], rule: ImpactRule, contact: bool = True) -> Stepper:
@@ -165,7 +228,7 @@ class _Within:
         size = self.slopes.shape[1] - 1
         self.slopes[rows[:, None], np.arange(size), np.arange(size)] = 1
 
-    def move_on(self, learned: Learned, theta, rows, state, dt, rule: ImpactRule) -> Int[np.ndarray, " D"]:
+    def move_on(self, learned: Learned, theta, rows, state, dt, rule: ImpactRule, thin: bool) -> Int[np.ndarray, " D"]:
         """Go on by a segment; which windows are at the end of their step."""
         padded = _padded(rows, NEAR)
         x, v, left, acted, push, count, start = (
@@ -174,14 +237,15 @@ class _Within:
         )
         none = jnp.zeros(len(padded))
         now = Progress(x, v, left, acted, none > 0, none.astype(int), none, push)
-        end, own = _compiled_segments()(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule)
-        end, own = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], (end, own))
+        out = _compiled_segments()(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule, thin)
+        end, own, ways = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], out)
         self.state[rows], self.left[rows] = np.stack([end.x, end.v], 1), end.left
         self.acted[rows], self.push[rows] = end.acted, end.push
         self.segments[rows] += 1
-        size = self.slopes.shape[1]
-        slopes = own[:, :, :size] @ self.slopes[rows]
-        slopes[:, :, size - 1 :] += own[:, :, size:]
+        size, m = ways.shape[1:]
+        before = self.slopes[rows]
+        slopes = own[:, :, :m] @ (np.swapaxes(ways, 1, 2) @ before[:, :size]) + own[:, :, m : m + 1] * before[:, size:]
+        slopes[:, :, size:] += own[:, :, m + 1 :]
         self.slopes[rows] = slopes
         return rows[~(end.left > 0)]
 
@@ -192,6 +256,19 @@ class Flow:
     def __init__(self, learned: Learned, rule: ImpactRule):
         self.learned = learned
         self.rule: ImpactRule = rule
+        self.thin: bool | None = None
+
+    def _is_thin(self, theta: Array, z: Float[np.ndarray, "W 2 n d"]) -> bool:
+        """Whether states may be moved along their constraints alone: these are independent, and the same for all theta.
+
+        Else derivatives are by all numbers of a state.
+        """
+        if self.thin is None:
+            self.thin = False
+            if self.learned.skeleton.links:
+                values, moved = _constrained(self.learned, theta, jnp.asarray(z[0]))
+                self.thin = bool(values.min() > INDEPENDENT) and not bool(moved)
+        return self.thin
 
     @np.errstate(over="ignore", invalid="ignore")  # motion that goes wrong is seen by who asks for it
     def __call__(
@@ -204,13 +281,14 @@ class Flow:
         count, most = steps.shape
         size, P = z[0].size, len(theta)
         there = jnp.asarray(theta)
-        state = np.array(z, float)
+        thin = self._is_thin(there, z)
+        state, start = np.array(z, float), np.array(z, float)
         slopes = np.zeros((count, size, size + P))
         slopes[:, :, :size] = np.eye(size)
         if self.learned.skeleton.links:
             for rows in _batches(np.arange(count), FREE):
-                new, by = _starts(self.learned, there, jnp.asarray(state[_padded(rows, FREE)]))
-                state[rows], slopes[rows] = np.asarray(new)[: len(rows)], np.asarray(by)[: len(rows)]
+                out = _starts(self.learned, there, jnp.asarray(state[_padded(rows, FREE)]))
+                start[rows], state[rows], slopes[rows] = (np.asarray(a)[: len(rows)] for a in out)
         half = size // 2
         x = np.zeros((count, most + 1, half))
         by = np.zeros((count, most + 1, half, size + P))
@@ -223,10 +301,8 @@ class Flow:
         hits: list[tuple] = []
         within = _Within(self.learned.skeleton, z, P)
 
-        def commit(rows, new, own):
-            state[rows] = new
-            slopes[rows] = own[:, :, :size] @ slopes[rows]
-            slopes[rows, :, size:] += own[:, :, size:]
+        def commit(rows, new, by_start_and_theta):
+            state[rows], slopes[rows] = new, by_start_and_theta
             at[rows] += 1
             x[rows, at[rows]], by[rows, at[rows]] = state[rows, 0].reshape(-1, half), slopes[rows, :half]
 
@@ -235,32 +311,47 @@ class Flow:
             for rows in _batches(going, FREE):
                 padded = _padded(rows, FREE)
                 out = _free_steps(
-                    self.learned, there, jnp.asarray(state[padded]), jnp.asarray(steps[padded, at[padded]]), self.rule
+                    self.learned,
+                    there,
+                    jnp.asarray(state[padded]),
+                    jnp.asarray(steps[padded, at[padded]]),
+                    self.rule,
+                    thin,
                 )
-                new, own, near = (np.asarray(a)[: len(rows)] for a in out)
+                new, own, ways, near = (np.asarray(a)[: len(rows)] for a in out)
                 touch = near.any(axis=1)
                 waiting[rows[touch]], closed[rows[touch]] = True, near[touch]
                 alone[rows[touch]] = new[touch, 1].reshape(-1, half)
                 within.begin(rows[touch], state, steps[rows[touch], at[rows[touch]]])
-                commit(rows[~touch], new[~touch], own[~touch])
+                m, free = ways.shape[2], rows[~touch]
+                moved = own[~touch][:, :, :m] @ (np.swapaxes(ways[~touch], 1, 2) @ slopes[free])
+                moved[:, :, size:] += own[~touch][:, :, m:]
+                commit(free, new[~touch], moved)
             queue = np.flatnonzero(waiting)
             if not len(queue) and not len(going):
                 break
             if len(queue) < NEAR and np.any((at < length) & ~waiting):
                 continue
             for rows in _batches(queue, NEAR):
-                done = within.move_on(self.learned, there, rows, state, steps[rows, at[rows]], self.rule)
+                done = within.move_on(self.learned, there, rows, state, steps[rows, at[rows]], self.rule, thin)
                 rows, new, own = done, within.state[done], within.slopes[done][:, :-1]
                 jump = np.linalg.norm(new[:, 1].reshape(-1, half) - alone[rows], axis=1)
                 hit = jump > 1e-9 * np.linalg.norm(alone[rows], axis=1)
                 if hit.any():
                     strength = _strength(own[hit][:, :, size:], steps[rows, at[rows]][hit])
                     hits.append((rows[hit], at[rows][hit], jump[hit], strength, closed[rows][hit]))
-                commit(rows, new, own)
+                moved = own[:, :, :size] @ slopes[rows]
+                moved[:, :, size:] += own[:, :, size:]
+                commit(rows, new, moved)
                 waiting[rows] = False
+        if are_elsewhere(self.learned.skeleton):
+            matrix, by_number = map(np.asarray, _recorded(self.learned, there))
+            by = np.einsum("rq,wtqs->wtrs", matrix, by)
+            by[..., size:] += np.einsum("rqp,wtq->wtrp", by_number, x)
+            x = x @ matrix.T
         joined = [np.concatenate(parts) for parts in zip(*hits, strict=True)] if hits else None
         found = Hits(*joined) if joined else _none(P, closed.shape[1])
-        return Motion(x, by[..., :size], by[..., size:], found)
+        return Motion(start, x, by[..., :size], by[..., size:], found)
 
 
 def _none(P: int, C: int) -> Hits:

@@ -42,6 +42,10 @@ LOST = 4.0
 """Windows whose mean squared residual is more than so many times the typical one do not fit."""
 
 
+MISFIT = 2.0
+"""What is left after impacts is no noise where it is more than so many times what is left before them."""
+
+
 class Reduced(NamedTuple):
     """Of each window: curvature and gradient by theta with its start eliminated, and how the start follows."""
 
@@ -58,6 +62,13 @@ class State(NamedTuple):
     z: Float[np.ndarray, "W 2 n d"]
     motion: Motion
     residual: Float[np.ndarray, "W T R"]
+
+
+class Sizes(NamedTuple):
+    """Mean squared residuals before and after impacts."""
+
+    before: float
+    after: float
 
 
 class Shooting:
@@ -83,6 +94,7 @@ class Shooting:
         self.reach = float(np.nanmax(windows.x) - np.nanmin(windows.x))
         self.kept = self.numbers > 0
         self.fits = np.ones(len(windows.x), bool)
+        self.misfit = 1.0
 
     def keep_what_fits(self, state: State) -> None:
         """Leave out, of plain sums of squares, windows that do not fit, and single samples that are far off."""
@@ -91,6 +103,8 @@ class Shooting:
         self.fits = each <= LOST * typical
         near = self.distance(state) <= OUTLIER**2 * typical
         self.kept = (self.numbers > 0) & self.fits[:, None] & near
+        before, after = self.sizes(state)
+        self.misfit = after / before if after > MISFIT * before else 1.0
 
     @np.errstate(over="ignore", invalid="ignore")
     def at(self, theta: Float[np.ndarray, " P"], z: Float[np.ndarray, "W 2 n d"]) -> State:
@@ -102,21 +116,26 @@ class Shooting:
         wrong = np.maximum.accumulate(~sound, axis=1)
         motion.by_start[wrong], motion.by_theta[wrong] = 0.0, 0.0
         off = np.where(wrong[..., None], FAR * self.reach, motion.x - np.where(self.seen, self.windows.x, 0))
-        return State(theta, z, motion, np.where(self.seen, off / self.noise, 0.0))
+        return State(theta, motion.start, motion, np.where(self.seen, off / self.noise, 0.0))
 
     def distance(self, state: State) -> Float[np.ndarray, "W T"]:
         """Mean squared residual of each sample; 0 where nothing was seen."""
         return np.sum(state.residual**2, axis=2) / np.maximum(self.numbers, 1)
 
-    def size(self, state: State) -> float:
-        """What is left after impacts, typically: a mean squared residual, of no less than is left before them."""
+    def sizes(self, state: State) -> Sizes:
+        """What is left before and after impacts, typically: mean squared residuals, after of no less than before."""
         rows, distance = (self.numbers > 0) & self.used[:, None], self.distance(state)
         before, after = rows & self.windows.before, rows & ~self.windows.before
         if not before.any():
-            return max(1.0, float(np.median(distance[after if after.any() else self.numbers > 0])))
-        least = float(np.median(distance[before]))
-        least = max(least, self.least) if least < EXACT else 1.0
-        return max(least, float(np.median(distance[after if after.any() else before])))
+            size = max(1.0, float(np.median(distance[after if after.any() else self.numbers > 0])))
+            return Sizes(size, size)
+        left = float(np.median(distance[before]))
+        left = max(left, self.least if left < EXACT else 1.0)
+        return Sizes(left, max(left, float(np.median(distance[after if after.any() else before]))))
+
+    def of_samples(self, sizes: Sizes) -> Float[np.ndarray, "W T"]:
+        """Those of all samples."""
+        return np.where(self.windows.before, *sizes)
 
     def of_windows(self, state: State) -> Float[np.ndarray, " W"]:
         """Mean squared residual of each window, starts taken into account."""
@@ -129,21 +148,28 @@ class Shooting:
         ties = 0 if not system.links else int(system.constraints(jnp.asarray(self.windows.start[0, 0])).shape[0])
         return self.windows.start[0].size - 2 * ties
 
-    def weight(self, state: State, size: float, loss: Loss) -> Float[np.ndarray, "W T"]:
-        """Weights of all samples; of a plain sum of squares, those that are `kept`."""
-        distance = self.distance(state) / size
-        if loss == "squares":
-            return self.kept.astype(float)
-        if loss == "redescending":
-            return np.where(self.numbers > 0, (1 + distance / CUTOFF) ** -2, 0)
-        return np.where(self.numbers > 0, np.minimum(1, np.sqrt(2 / np.maximum(distance, 1e-30))), 0)
+    def weight(self, state: State, sizes: Sizes, loss: Loss) -> Float[np.ndarray, "W T"]:
+        """Weights of all samples, 1 before impacts where they fit; of plain sums of squares, of those that are `kept`.
 
-    def costs(self, state: State, size: float, loss: Loss) -> Float[np.ndarray, " W"]:
-        """Sum of rho over the samples of each window."""
-        distance = self.distance(state) / size
+        What no quantities explain makes samples after impacts count for less, or starts would be bent to them.
+        """
         if loss == "squares":
-            rho = np.where(self.kept, distance, 0)
-        elif loss == "redescending":
+            return self.kept / np.where(self.windows.before, 1.0, self.misfit)
+        size = self.of_samples(sizes)
+        distance = self.distance(state) / size
+        if loss == "redescending":
+            weight = (1 + distance / CUTOFF) ** -2
+        else:
+            weight = np.minimum(1, np.sqrt(2 / np.maximum(distance, 1e-30)))
+        return np.where(self.numbers > 0, weight * sizes.before / size, 0)
+
+    def costs(self, state: State, sizes: Sizes, loss: Loss) -> Float[np.ndarray, " W"]:
+        """Sum of rho over the samples of each window."""
+        if loss == "squares":
+            rho = self.weight(state, sizes, loss) * self.distance(state) / sizes.before
+            return np.sum(self.numbers * rho, axis=1)
+        distance = self.distance(state) / self.of_samples(sizes)
+        if loss == "redescending":
             rho = distance / (1 + distance / CUTOFF)
         else:
             rho = np.where(distance < 2, distance, 2 * np.sqrt(2 * np.maximum(distance, 2)) - 2)
@@ -202,9 +228,9 @@ def shoot(
     for k, loss in enumerate(losses):
         if loss == settled:
             continue
-        size = shooting.size(state)
-        cost = shooting.costs(state, size, loss)
-        reduced = shooting.reduced(state, shooting.weight(state, size, loss), damping)
+        sizes = shooting.sizes(state)
+        cost = shooting.costs(state, sizes, loss)
+        reduced = shooting.reduced(state, shooting.weight(state, sizes, loss), damping)
         H, g = reduced.curvature[used].sum(axis=0), reduced.gradient[used].sum(axis=0)
         change = np.zeros_like(g)
         if not held and len(g):
@@ -213,12 +239,12 @@ def shoot(
                 ends = tuple(np.where(still, 0.0, end) for end in ends)
             change = newton_step(H, g, prior, change, change, *ends)
         directions, curvature, _ = spectrum(H, prior)
-        error = np.sqrt(np.sum(directions**2 / curvature, axis=1) * size)
+        error = np.sqrt(np.sum(directions**2 / curvature, axis=1) * sizes.before)
         small = bool(np.all(np.abs(change) < SETTLED * error))
         for share in 0.25 ** np.arange(4):
             move = -(share * reduced.own + reduced.follow @ (share * change))
             there = shooting.at(state.theta + share * change, state.z + move.reshape(state.z.shape))
-            now = shooting.costs(there, size, loss)
+            now = shooting.costs(there, sizes, loss)
             # At first starts have not been fitted to what comes after impacts. At last a window that no longer fits
             # counts for more than what a step wins.
             if now[used].sum() < cost[used].sum() or k == 0 or (small and not held):
@@ -231,7 +257,7 @@ def shoot(
         fallen = 1 - now[used].sum() / max(cost[used].sum(), 1e-300)
         state = there
         if each is not None:
-            each(float(np.sqrt(shooting.size(state))))
+            each(float(np.sqrt(shooting.sizes(state).after)))
         if small and (not held or fallen < SETTLED):
             settled = loss
     return state

@@ -23,21 +23,13 @@ from jaxtyping import Int
 
 from carom.checks import require
 from carom.contact.boxes import CornerPlane
-from carom.contact.impulses import Coulomb
 from carom.learning.dataset import closed_contacts
 from carom.learning.estimation.protocols import body_points, box_of, box_points, pose_errors
 from carom.learning.estimation.robust import Blocks, Solution, solve
-from carom.learning.estimation.toss_config import (
-    LOSSES,
-    TossConfig,
-    TossQuantity,
-    limits,
-    read_values,
-    toss_quantities,
-    with_values,
-)
+from carom.learning.estimation.toss_config import TossConfig, search_steps, tossed_names
 from carom.learning.progress import LoopProgress
 from carom.learning.run import RunFolder
+from carom.learning.unknowns.quantities import Learned
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Gravity
 from carom.recordings.recording import Recording
@@ -48,10 +40,11 @@ from carom.system import System
 
 @dataclasses.dataclass(frozen=True)
 class TossEstimate:
-    """A learned number, its unit, and its standard error by the segments (None: not told by them)."""
+    """A learned number, what it is of, its unit, and its standard error by the segments (None: not told by them)."""
 
     value: float
     standard_error: float | None
+    of: str
     unit: str
 
 
@@ -76,17 +69,6 @@ def can_learn_tosses(system: System) -> bool:
         and any(isinstance(contact, CornerPlane) for contact in system.contacts)
         and isinstance(system.potential, Gravity)
     )
-
-
-def prepared(system: System, config: TossConfig) -> System:
-    """The system with the contact model that is chosen, and room for the contacts of a face."""
-    if config.toss_contact_model is not None:
-        system = system.with_contact_model(config.toss_contact_model)
-    require(
-        isinstance(system.contact_model, Coulomb) or not LOSSES & set(config.names),
-        f"{', '.join(sorted(LOSSES))} belong to the contact model coulomb; the system has another.",
-    )
-    return system.with_max_active(4)
 
 
 # --- predictions --------------------------------------------------------------------------------------------------
@@ -120,34 +102,33 @@ def _predict(system: System, x0, v0, stepper: Stepper, samples: int, substeps: i
 
 
 @eqx.filter_jit
-def _tosses(system, learned, values, x0, v0, stepper, samples, substeps):
-    return _predict(with_values(system, learned, values), x0, v0, stepper, samples, substeps)
+def _tosses(learned: Learned, theta, x0, v0, stepper, samples, substeps):
+    return _predict(learned.assemble(theta), x0, v0, stepper, samples, substeps)
 
 
 BATCH = 100
 """Segments that are simulated at once; batches are filled up, so that there is one program whatever their number."""
 
 
-def _segments(system, learned, values, x0, v0, end, stepper, samples, substeps):
-    """Residuals (S, samples, points, 3) of segments and their derivatives (..., p) by the values."""
+def _segments(learned: Learned, theta, x0, v0, end, stepper, samples, substeps):
+    """Residuals (S, samples, points, 3) of segments and their derivatives (..., P) by the free numbers."""
     count = len(x0)
     rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1).reshape(-1, BATCH)
     parts = [
-        _segment_batch(system, learned, values, x0[r], v0[r], end[r], stepper, samples, substeps)
-        for r in jnp.asarray(rows)
+        _segment_batch(learned, theta, x0[r], v0[r], end[r], stepper, samples, substeps) for r in jnp.asarray(rows)
     ]
     return (np.concatenate([np.asarray(part) for part in each])[:count] for each in zip(*parts, strict=True))
 
 
 @eqx.filter_jit
-def _segment_batch(system, learned, values, x0, v0, end, stepper, samples, substeps):
+def _segment_batch(learned: Learned, theta, x0, v0, end, stepper, samples, substeps):
 
-    def residual(values):
-        x = _predict(with_values(system, learned, values), x0, v0, stepper, samples, substeps)
+    def residual(theta):
+        x = _predict(learned.assemble(theta), x0, v0, stepper, samples, substeps)
         return x[:, 1:] - end
 
-    basis = jnp.eye(len(values))
-    out, columns = jax.vmap(lambda t: jax.jvp(residual, (values,), (t,)), out_axes=(None, -1))(basis)
+    basis = jnp.eye(len(theta))
+    out, columns = jax.vmap(lambda t: jax.jvp(residual, (theta,), (t,)), out_axes=(None, -1))(basis)
     return out, columns
 
 
@@ -203,14 +184,13 @@ DAMPING = 1e-2
 """Curvature added for each quantity, in units of its scale and of errors of 1 mm: what no segment tells stays."""
 
 
-def _stage(
-    system: System, learned: Sequence[TossQuantity], values, recording: Recording, horizon: int, config: TossConfig
-):
-    """Gauss-Newton steps over one horizon: new values, and the last solution (in units of the scales)."""
-    steps = choose_segments(recording, system, horizon, config.segments, config.toss_seed)
+def _stage(learned: Learned, theta, recording: Recording, horizon: int, config: TossConfig, seed: int):
+    """Gauss-Newton steps over one horizon: free numbers, their standard errors, and how many segments there were."""
+    system, count = learned.skeleton, len(learned.names)
+    steps = choose_segments(recording, system, horizon, config.segments, seed)
     require(
-        len(steps) >= len(learned),
-        f"the recording has {len(steps)} segments of {horizon} samples around impacts, too few for {len(learned)} "
+        len(steps) >= count,
+        f"the recording has {len(steps)} segments of {horizon} samples around impacts, too few for {count} "
         "quantities. Give more tosses, learn less, or use shorter horizons.",
     )
     k, s = steps.T
@@ -219,32 +199,29 @@ def _stage(
     size = float(jnp.min(box_of(system).half_widths))
     # The axes' ends move by as much as the body's surface does.
     reach = np.concatenate([[1.0], np.full(3, size)])[:, None]
-    scale = np.array([each.step for each in learned])
-    lower, upper = limits(learned)
+    scale, lower, upper = search_steps(learned), np.asarray(learned.lower), np.asarray(learned.upper)
     cluster = k if recording.group is None else np.asarray(recording.group)[k]
     stepper = toss_stepper(recording.dt, config.substeps)
     solution = None
     for _ in range(config.toss_rounds):
-        residual, columns = _segments(
-            system, learned, jnp.asarray(values), x0, v0, end, stepper, horizon, config.substeps
-        )
+        residual, columns = _segments(learned, jnp.asarray(theta), x0, v0, end, stepper, horizon, config.substeps)
         residual = np.concatenate([residual[..., :1, :], residual[..., 1:, :] - residual[..., :1, :]], axis=-2) * reach
         first = columns[..., :1, :, :]
         columns = np.concatenate([first, columns[..., 1:, :, :] - first], axis=-3) * reach[..., None] * scale
-        flat = residual.reshape(len(k), -1), columns.reshape(len(k), -1, len(learned))
+        flat = residual.reshape(len(k), -1), columns.reshape(len(k), -1, count)
         fine = np.isfinite(flat[0]).all(axis=1) & np.isfinite(flat[1]).all(axis=(1, 2))
         blocks = Blocks(flat[0][fine] / 1e-3, flat[1][fine] / 1e-3, cluster[fine], np.zeros(int(fine.sum()), int))
         solution = solve(
             blocks,
-            DAMPING * np.eye(len(learned)),
-            np.zeros(len(learned)),
-            np.maximum((lower - values) / scale, -2.0),
-            np.minimum((upper - values) / scale, 2.0),
+            DAMPING * np.eye(count),
+            np.zeros(count),
+            np.maximum((lower - theta) / scale, -2.0),
+            np.minimum((upper - theta) / scale, 2.0),
             redescend=True,
         )
-        values = values + scale * solution.change
+        theta = theta + scale * solution.change
     assert isinstance(solution, Solution)
-    return values, scale * solution.standard_error, len(steps)
+    return theta, scale * solution.standard_error, len(steps)
 
 
 # --- whole tosses -------------------------------------------------------------------------------------------------
@@ -253,20 +230,23 @@ def _stage(
 def learn_tosses(
     skeleton: System,
     recording: Recording,
+    learn: Sequence[str] | None = None,
     config: TossConfig | None = None,
     *,
+    seed: int = 0,
     run: RunFolder | None = None,
     progress: bool = True,
 ) -> tuple[System, TossReport]:
     """Learn numbers of a tossed body from recorded tosses; see the top of this file for the method.
 
     **Arguments:** `skeleton`, one rigid body whose corners meet a plane under gravity: its numbers are where the fit
-    starts; `recording`, of tosses, with velocities at the samples (`carom import poses` makes such); `run`, a folder
-    for metrics, by which a fit that was stopped goes on.
+    starts; `recording`, of tosses, with velocities at the samples (`carom import poses` makes such); `learn`, names of
+    quantities as `Learned.chosen` takes them, by default `tossed_names`; `seed`, of which segments are used where there
+    are more; `run`, a folder for metrics, by which a fit that was stopped goes on.
 
     **Returns:** the learned system and a report.
 
-    **Raises:** `CaromError` for another kind of system, or too few impacts.
+    **Raises:** `CaromError` for another kind of system, names of nothing, or too few impacts.
     """
     import time
 
@@ -277,12 +257,12 @@ def learn_tosses(
         "tosses are learned for one rigid body with a CornerPlane contact under Gravity; this system is another.",
     )
     require(recording.x.shape[2:] == (4, 3), f"tosses have 4 points in 3D; the recording has {recording.x.shape[2:]}.")
-    system = prepared(skeleton, config)
-    learned = toss_quantities(system, config.names)
-    values = read_values(system, learned)
+    learned = Learned.chosen(skeleton.with_max_active(4), tossed_names(skeleton) if learn is None else learn)
+    require(len(learned.names) > 0, "learn must name something, such as half_width, friction; it was empty.")
+    theta = np.array(learned.free())
     known = [] if run is None else run.metrics()
     started = time.monotonic() - (known[-1]["seconds"] if known else 0.0)
-    errors, count = np.full(len(learned), np.nan), 0
+    errors, count = np.full(len(theta), np.nan), 0
     done = {row["horizon"]: row for row in known if "horizon" in row}
 
     def log(**row: Any) -> None:
@@ -294,64 +274,65 @@ def learn_tosses(
         for number, horizon in enumerate(config.horizons, 1):
             if horizon in done:
                 row = done[horizon]
-                values, errors, count = np.array(row["values"]), np.array(row["errors"], float), row["segments"]
+                theta, errors, count = np.array(row["theta"]), np.array(row["errors"], float), row["segments"]
                 continue
-            values, errors, count = _stage(system, learned, values, recording, horizon, config)
-            log(horizon=horizon, values=values.tolist(), errors=errors.tolist(), segments=count)
-            shown.update(number, f"segments of {horizon}: " + _named(learned, values))
+            theta, errors, count = _stage(learned, theta, recording, horizon, config, seed)
+            log(horizon=horizon, theta=theta.tolist(), errors=errors.tolist(), segments=count)
+            shown.update(number, f"segments of {horizon}: " + _named(learned, theta))
         before = [row for row in known if "loss" in row]
-        values, made = _search(system, learned, values, recording, config, before, log, shown)
-    system = with_values(system, learned, jnp.asarray(values))
-    position, rotation = _whole(system, (), np.zeros(0), recording, config)
+        theta, made = _search(learned, theta, recording, config, before, log, shown)
+    position, rotation = _whole(learned, theta, recording, config)
+    system, seconds = learned.assemble(jnp.asarray(theta)), time.monotonic() - started
+    # What a small change of each free number does to its value.
+    values, beyond = (np.asarray(learned.physical(jnp.asarray(at))) for at in (theta, theta + 1e-3 * errors))
     estimates = {
-        each.name: TossEstimate(float(value), float(error) if np.isfinite(error) else None, each.quantity.unit)
-        for each, value, error in zip(learned, values, errors, strict=True)
+        name: TossEstimate(float(value), abs(float(more - value)) / 1e-3 if np.isfinite(more) else None, of, unit)
+        for name, of, unit, value, more in zip(learned.names, learned.of, learned.units, values, beyond, strict=True)
     }
-    seconds = time.monotonic() - started
     report = TossReport(estimates, float(position.mean()), float(rotation.mean()), len(position), count, made, seconds)
     return system, report
 
 
-def _whole(system: System, learned, values, recording: Recording, config: TossConfig):
+def _whole(learned: Learned, theta, recording: Recording, config: TossConfig):
     """Errors of whole tosses from their first states: position (share of the width) and rotation (rad), each (N,)."""
     samples = min(config.toss_samples, recording.x.shape[1] - 1)
     stepper = toss_stepper(recording.dt, config.substeps)
     x0, v0 = jnp.asarray(recording.x[:, 0]), jnp.asarray(recording.v[:, 0])
-    x = np.asarray(_tosses(system, learned, jnp.asarray(values), x0, v0, stepper, samples, config.substeps))
+    x = np.asarray(_tosses(learned, jnp.asarray(theta), x0, v0, stepper, samples, config.substeps))
     position, rotation = pose_errors(x, recording.x[:, : samples + 1], np.minimum(recording.length, samples + 1))
-    return position / (2 * float(jnp.min(box_of(system).half_widths))), rotation
+    return position / (2 * float(jnp.min(box_of(learned.assemble(jnp.asarray(theta))).half_widths))), rotation
 
 
-def _search(system, learned, values, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
+def _search(learned: Learned, theta, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
     """Nelder and Mead's search over whole tosses, which repeats what `before` holds without computing it again."""
     if config.evaluations == 0:
-        return values, 0
-    scale = np.array([each.step for each in learned])
-    lower, upper = limits(learned)
-    known = {tuple(row["values"]): row["loss"] for row in before}
-    made, best = 0, (np.inf, values)
-    base = values.clip(lower, upper)
+        return theta, 0
+    scale, count = search_steps(learned), len(theta)
+    known = {tuple(row["theta"]): row["loss"] for row in before}
+    base = np.asarray(learned.project(jnp.asarray(theta)))
+    made, best = 0, (np.inf, base)
 
     def loss(z) -> float:
         nonlocal made, best
-        tried = (base + scale * z).clip(lower, upper)
+        tried = np.asarray(learned.project(jnp.asarray(base + scale * z)))
         made += 1
         key = tuple(tried.tolist())
         if key not in known:
-            position, rotation = _whole(system, learned, tried, recording, config)
+            position, rotation = _whole(learned, tried, recording, config)
             # A simulation that ends nowhere is as bad as can be.
             known[key] = float(np.nan_to_num(position, nan=10.0).mean() + np.nan_to_num(rotation, nan=np.pi).mean())
-            log(values=tried.tolist(), loss=known[key])
+            log(theta=tried.tolist(), loss=known[key])
         if known[key] < best[0]:
             best = known[key], tried
         shown.update(len(config.horizons) + made, f"whole tosses {best[0]:.4f}: " + _named(learned, best[1]))
         return known[key]
 
-    simplex = np.concatenate([np.zeros((1, len(learned))), 0.5 * np.eye(len(learned))])
+    simplex = np.concatenate([np.zeros((1, count)), 0.5 * np.eye(count)])
     options = {"maxfev": config.evaluations, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}
-    scipy.optimize.minimize(loss, np.zeros(len(learned)), method="Nelder-Mead", options=options)
+    scipy.optimize.minimize(loss, np.zeros(count), method="Nelder-Mead", options=options)
     return best[1], made
 
 
-def _named(learned: Sequence[TossQuantity], values) -> str:
-    return ", ".join(f"{each.name} {value:.4g}" for each, value in zip(learned, values, strict=True))
+def _named(learned: Learned, theta) -> str:
+    values = np.asarray(learned.physical(jnp.asarray(theta)))
+    return ", ".join(f"{name} {value:.4g}" for name, value in zip(learned.names, values, strict=True))

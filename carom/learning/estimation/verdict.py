@@ -119,11 +119,12 @@ def spread(shooting: Shooting, state: State, clusters: Int[np.ndarray, " W"], sh
     learned = shooting.flow.learned
     scale, lower, upper = (np.asarray(part, float) for part in (learned.scale, learned.lower, learned.upper))
     rows = np.flatnonzero(shooting.used & shooting.fits)
-    reduced = shooting.reduced(state, shooting.weight(state, 1.0, "squares"), np.zeros(len(state.z)))
+    weight = shooting.weight(state, shooting.sizes(state), "squares")
+    reduced = shooting.reduced(state, weight, np.zeros(len(state.z)))
     H = reduced.curvature[rows].sum(axis=0)
     at_bound = (state.theta <= lower) | (state.theta >= upper)
     total, free = _sums(shooting, state)
-    left = total[rows].sum() / max(free[rows].sum() - len(H), 1.0)
+    left = (weight[..., None] * total)[rows].sum() / max(free[rows].sum() - len(H), 1.0)
     prior = np.diag(scale**-2.0) * 1e-6
     directions, curvature, _ = spectrum(H, prior)
     inverse = (directions / curvature) @ directions.T
@@ -223,14 +224,16 @@ def _bound(shooting: Shooting, state: State, j: int, way: float) -> float | None
     end = float(np.asarray(learned.lower if way < 0 else learned.upper)[j])
     if not np.isfinite(end):
         return None
-    size = shooting.size(state)
-    allowed = float(np.sum(shooting.costs(state, size, "redescending")[shooting.used])) + float(stats.chi2.ppf(0.95, 1))
+    sizes = shooting.sizes(state)
+    allowed = float(np.sum(shooting.costs(state, sizes, "redescending")[shooting.used])) + float(
+        stats.chi2.ppf(0.95, 1)
+    )
 
     def is_worse(value: float) -> bool:
         theta = state.theta.copy()
         theta[j] = value
         there = shoot(shooting, theta, state.z, ("redescending",) * 2, held=True)
-        return float(np.sum(shooting.costs(there, size, "redescending")[shooting.used])) > allowed
+        return float(np.sum(shooting.costs(there, sizes, "redescending")[shooting.used])) > allowed
 
     if not is_worse(end):
         return None
