@@ -17,7 +17,7 @@ import carom
 from carom.learning.dataset import Chunks, closed_contacts
 from carom.learning.training.loss import gather_chunks, train_step
 from carom.learning.training.optimizer import Rates
-from carom.learning.training.train import fresh_state
+from carom.learning.training.start import fresh_state
 from carom.simulation.impact import Stepper
 
 CONFIG = carom.LearnConfig()

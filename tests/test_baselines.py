@@ -14,7 +14,8 @@ from carom.contact.impulses import ContactModel, Jump
 from carom.learning.dataset import Chunks, Dataset
 from carom.learning.training.loss import train_step
 from carom.learning.training.optimizer import Rates
-from carom.learning.training.train import fresh_state, learn
+from carom.learning.training.start import fresh_state
+from carom.learning.training.train import learn
 from carom.learning.unknowns.baselines import (
     BASELINES,
     InteractionContact,

@@ -19,7 +19,8 @@ from carom.learning.model_file import read_model_header
 from carom.learning.run import RunFolder
 from carom.learning.training.loss import train_step
 from carom.learning.training.optimizer import Rates
-from carom.learning.training.train import fresh_state, learn
+from carom.learning.training.start import fresh_state
+from carom.learning.training.train import learn
 from carom.simulation.impact import Stepper
 from carom.simulation.rollout import simulate
 

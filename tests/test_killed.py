@@ -25,7 +25,8 @@ from carom.learning.checkpoints import Checkpoints
 from carom.learning.dataset import Dataset
 from carom.learning.model_file import load_model_into, save_model
 from carom.learning.run import CONFIG, METRICS, MODEL, REPORT, RunFolder
-from carom.learning.training.train import fresh_state, learn
+from carom.learning.training.start import fresh_state
+from carom.learning.training.train import learn
 
 TASK = "ground-wall"
 TINY = carom.LearnConfig(

@@ -11,21 +11,13 @@ from systems import ball_on_floor
 import carom
 from carom.learning.config import LearnConfig
 from carom.learning.dataset import Dataset, contact_flags
-from carom.learning.estimation import state_windows
+from carom.learning.estimation import state_shooting
 from carom.learning.estimation.identify import identify
-from carom.learning.estimation.state_windows import (
-    Shooting,
-    Shot,
-    choose_windows,
-    estimate,
-    is_noisy,
-    shoot,
-    step_errors,
-    window_directions,
-)
+from carom.learning.estimation.state_shooting import Shooting, Shot, estimate, shoot
+from carom.learning.estimation.state_windows import choose_windows, is_noisy, step_errors, window_directions
 from carom.learning.run import RunFolder
 from carom.learning.training import train
-from carom.learning.training.train import initial_unknowns
+from carom.learning.training.start import initial_unknowns
 from carom.learning.unknowns.models import Unknowns
 from carom.learning.unknowns.parameters import at_bounds, moved, physical_vector
 from carom.recordings.recording import Recording
@@ -152,7 +144,7 @@ def test_learning_says_that_starts_were_estimated(system, dataset):
 
 @pytest.mark.slow
 def test_a_resumed_training_remembers_what_was_estimated_at_first(system, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(state_windows, "AS_GOOD", 0.0)  # never good enough: epochs follow
+    monkeypatch.setattr(state_shooting, "AS_GOOD", 0.0)  # never good enough: epochs follow
     rivals: list[Unknowns | None] = []
 
     def at_first_only(*arguments, rival, **options):

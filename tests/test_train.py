@@ -13,7 +13,8 @@ import carom
 from carom.learning.dataset import Dataset
 from carom.learning.estimation.refine import can_be_refined
 from carom.learning.run import RunFolder
-from carom.learning.training.train import initial_unknowns, learn
+from carom.learning.training.start import initial_unknowns
+from carom.learning.training.train import learn
 from carom.learning.unknowns.models import NeuralPotential, Unknowns, mass_ratios
 
 TINY = carom.LearnConfig(

@@ -13,7 +13,7 @@ there errors decide which contacts act. What is left is minimised by the robust
 estimator of `robust.py`, from the learned values on, clustered by trajectory.
 
 Where states are noisier than a tenth of what a step moves, few steps are beyond doubt. Then windows of many states are
-looked at, whose start states are estimated too (`state_windows.py`), and standard errors are those of that estimator.
+looked at, whose start states are estimated too (`state_shooting.py`), and standard errors are those of that estimator.
 
 A neural potential is profiled out: the weights in which it is linear are estimated along with the physical parameters
 (along the principal directions of the forces they can make), so that standard errors hold what masses and forces can
@@ -47,7 +47,7 @@ from carom.learning.estimation.refine import (
     sensitivities,
 )
 from carom.learning.estimation.sensitivity import StepSensitivity
-from carom.learning.estimation.state_windows import shoot, shooting_of
+from carom.learning.estimation.state_shooting import shoot, shooting_of
 from carom.learning.meetings import check_meetings
 from carom.learning.unknowns.models import Unknowns
 from carom.learning.unknowns.parameters import unknowns_of

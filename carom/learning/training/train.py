@@ -6,30 +6,27 @@ import time
 import warnings
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
 
 from carom.checks import require
-from carom.contact.impulses import CMr, ContactModel
-from carom.errors import CaromError
+from carom.contact.impulses import CMr
 from carom.learning.config import FORMULATIONS, LearnConfig
 from carom.learning.data_checks import check_dataset
 from carom.learning.dataset import Chunks, Dataset, contact_flags
 from carom.learning.estimation.refine import Fit, can_be_refined, polish
-from carom.learning.estimation.state_windows import Shot, estimate
+from carom.learning.estimation.state_shooting import Shot, estimate
 from carom.learning.progress import LoopProgress, training_text
 from carom.learning.run import RunFolder
 from carom.learning.training.devices import from_first, own_devices
 from carom.learning.training.loss import gather_chunks, train_step, validate
 from carom.learning.training.optimizer import Rates, fresh_optimizer, learning_rate_schedule
-from carom.learning.unknowns.baselines import BASELINES, new_baseline, physical_quantities, with_baseline
-from carom.learning.unknowns.models import NeuralPotential, Unknowns, mass_ratios
+from carom.learning.training.start import TrainState, fresh_state
+from carom.learning.unknowns.baselines import physical_quantities
+from carom.learning.unknowns.models import Unknowns, mass_ratios
 from carom.recordings.recording import Recording
 from carom.simulation.impact import Stepper
-from carom.system import StepModel, System
+from carom.system import System
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,69 +47,9 @@ class LearnReport:
     refined: bool
     """Whether what was kept is what a refinement ended with (see `LearnConfig.refine`)."""
     starts_estimated: bool = False
-    """Whether start states were estimated too, for data noisier than a step moves (`estimation/state_windows.py`)."""
+    """Whether start states were estimated too, for data noisier than a step moves (`estimation/state_shooting.py`)."""
     epsilon: float | None = None
     """Of the contact model CMr."""
-
-
-class TrainState(eqx.Module):
-    """Everything a training needs to go on from."""
-
-    unknowns: Unknowns
-    optimizer: Any
-    best: Unknowns
-    best_loss: Float[Array, ""]
-    best_epoch: Int[Array, ""]
-    epoch: Int[Array, ""]
-    skipped: Int[Array, ""]
-    overflow: Int[Array, ""]
-    settled: Bool[Array, ""]  # masses and contact properties: they have been refined
-    shot: Unknowns  # estimated together with start states before the first epoch, if `has_shot`
-    has_shot: Bool[Array, ""]
-
-
-def initial_unknowns(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> Unknowns:
-    """Starting values: equal masses, the configured friction and restitution, a random network scaled to `recording`.
-
-    An epsilon that is learned starts from the skeleton's, whose contact model must be CMr.
-    A potential of the skeleton that is itself a `NeuralPotential` is taken as the starting point.
-    """
-    floats = skeleton.friction.dtype
-    count = skeleton.n_properties
-    baseline = initial_baseline(skeleton, config)
-    has = physical_quantities(skeleton if baseline is None else with_baseline(skeleton, baseline))
-
-    def chosen(name, value):
-        return value if name in config.learn and ("mass" if name == "potential" else name) in has else None
-
-    key = jax.random.key(config.seed)
-    potential = NeuralPotential.of(skeleton, recording, key=key, width=config.width, depth=config.depth)
-    if isinstance(skeleton.potential, NeuralPotential):
-        potential = skeleton.potential.extended(potential)
-    return Unknowns(
-        log_mass_ratio=chosen("mass", jnp.zeros(len(skeleton.bodies) - 1, floats)),
-        friction=chosen("friction", jnp.full(count, config.initial_friction, floats)),
-        restitution=chosen("restitution", jnp.full(count, config.initial_restitution, floats)),
-        potential=chosen("potential", potential),
-        log_epsilon=_initial_log_epsilon(skeleton) if config.epsilon == "learn" else None,
-        contact_model=baseline if isinstance(baseline, ContactModel) else None,
-        step_model=baseline if isinstance(baseline, StepModel) else None,
-    )
-
-
-def _initial_log_epsilon(skeleton: System) -> Float[Array, ""]:
-    model = skeleton.contact_model
-    if not isinstance(model, CMr) or float(model.epsilon) == 0:
-        raise CaromError('epsilon "learn" starts from the skeleton\'s: its contact model must be CMr, epsilon above 0.')
-    return jnp.log(model.epsilon)
-
-
-def initial_baseline(skeleton: System, config: LearnConfig) -> ContactModel | StepModel | None:
-    """The untrained network of a baseline; None for the others."""
-    if config.model not in BASELINES:
-        return None
-    sizes = {"width": config.width, "depth": config.depth} if config.model == "mlp-cd-clnn" else {}
-    return new_baseline(config.model, skeleton, jax.random.fold_in(jax.random.key(config.seed), 1), **sizes)
 
 
 REFINE_AFTER = 0.4
@@ -124,16 +61,6 @@ EXACT = 0.01
 """A refinement ends that came to this share of what is enough."""
 LOSS_WIDTH_DECAY = 1e-4
 """How narrow the quadratic part of the loss is at the end of a training, over its width at the start."""
-
-
-def fresh_state(skeleton: System, config: LearnConfig, recording: Recording | None = None) -> TrainState:
-    """The state before the first epoch; a network is scaled to `recording`."""
-    unknowns = initial_unknowns(skeleton, config, recording)
-    zero = jnp.asarray(0)
-    infinity = jnp.asarray(jnp.inf)
-    optimizer = fresh_optimizer(unknowns, config)
-    no = jnp.asarray(False)
-    return TrainState(unknowns, optimizer, unknowns, infinity, zero, zero, zero, zero, no, unknowns, no)
 
 
 def learn(
