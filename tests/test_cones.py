@@ -4,6 +4,7 @@
 """
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -206,3 +207,59 @@ def test_second_derivatives_say_that_there_are_none():
 
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         jax.hessian(f)(jnp.array([0.3]))
+
+
+# Two boxes on a pivot, in the scales of their contacts: mobility J J^T. Contacts at a corner and between them jam: the
+# impulse is 500 times what is asked for, and a step along it changes velocities by 6e-8 of its size.
+JAMMED_J = np.array(
+    [
+        [0.2032947913, -0.3470672772, 0.7637890766, -0.5048185609],
+        [-0.5996604810, 0.1671199735, -0.3405873794, 1.2783823740],
+        [-0.0179461095, 0.0093383115, -0.0127529143, -0.9997140072],
+        [0.1268617878, -0.0688148994, 0.0848302514, 7.3440214486],
+        [0.1929515684, 0.8949885929, 0.3759403846, 0.1429473263],
+        [0.6031653214, 0.0115728275, -0.7345249905, -0.1790159366],
+    ]
+)
+JAMMED_V = JAMMED_J @ [0.1698406624, -0.2793460139, 0.5867647707, -0.1484942369]
+JAMMED_FRICTION, JAMMED_RESTITUTION = np.array([0.613018, 1.098626, 0.480783]), np.array([0.685213, 0.754886, 0.642501])
+
+
+def by_every_mode(Q, q, mu, lower):
+    """Velocities after a program in 2D, and its impulse: of all that contacts may do the one of least energy."""
+    best = (np.inf, q)
+    for modes in itertools.product(("open", "sticks", "right", "left", "bound"), repeat=len(mu)):
+        columns, fixed = [], np.zeros(len(q))
+        for k, mode in enumerate(modes):
+            normal, tangent = np.eye(len(q))[2 * k : 2 * k + 2]
+            if mode in ("open", "bound"):
+                fixed += lower[k] * normal
+            columns += {
+                "open": [],
+                "sticks": [normal, tangent],
+                "right": [normal + mu[k] * tangent],
+                "left": [normal - mu[k] * tangent],
+                "bound": [tangent],
+            }[mode]
+        f = fixed
+        if columns:
+            G = np.stack(columns, axis=1)
+            f = fixed + G @ np.linalg.lstsq(G.T @ Q @ G, -G.T @ (Q @ fixed + q), rcond=1e-12)[0]
+        normal, tangent = f.reshape(-1, 2).T
+        if np.all(normal >= lower - 1e-9) and np.all(np.abs(tangent) <= mu * normal + 1e-9 * np.abs(f).max()):
+            best = min(best, (f @ Q @ f / 2 + f @ q, tuple(f)))
+    return Q @ np.array(best[1]) + q, np.array(best[1])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_jammed_contacts_leave_as_the_program_says(scale):
+    """To 1e-8 of what comes; a residual of 1e-12 of the impulse, which is large, left 2 % after the rebound."""
+    Q = JAMMED_J @ JAMMED_J.T
+    between, f = by_every_mode(Q, JAMMED_V, JAMMED_FRICTION, np.zeros(3))
+    after, _ = by_every_mode(Q, between, JAMMED_FRICTION, JAMMED_RESTITUTION * f[::2])
+    data = (Q, scale * JAMMED_V.reshape(3, 2), JAMMED_FRICTION, JAMMED_RESTITUTION, np.zeros((3, 2)))
+    compression, rebound = carom.contact_impulse(*(jnp.asarray(part) for part in data))
+    assert np.abs(compression).max() > 400 * scale
+    for impulse, expected in ((compression, between), (compression + rebound, after)):
+        found = JAMMED_V + Q @ np.asarray(impulse).ravel() / scale
+        np.testing.assert_allclose(found, expected, atol=1e-8)

@@ -83,7 +83,6 @@ def check_same(found: dict, one: dict) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_two_processes_train_like_one(tmp_path):
     check_same(train(tmp_path / "two", 2, processes=2), train(tmp_path / "one", 2))
 

@@ -12,8 +12,9 @@ from carom.contact.energy import islands
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
-@pytest.mark.parametrize("model", [carom.CM(), carom.Coulomb()], ids=["cm", "coulomb"])
+@pytest.mark.parametrize(
+    "model", [carom.CM(), pytest.param(carom.Coulomb(), marks=pytest.mark.ci_budget)], ids=["cm", "coulomb"]
+)
 def test_impacts_add_no_energy(model):
     rng = np.random.default_rng(2)
     made = [generate(rng, family, 64, ROOM, 3) for family in FAMILIES]

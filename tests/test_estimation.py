@@ -134,7 +134,6 @@ def test_free_motion_is_estimated_as_by_linear_least_squares():
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_the_middle_of_a_box_that_flies_tells_where_its_mass_is():
     """A body of equal moments of inertia turns at one rate about its centre of mass, which falls on a parabola.
 

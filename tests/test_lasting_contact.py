@@ -104,7 +104,6 @@ def test_a_block_slides_as_it_should(model):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_a_disk_rolls_down_a_slope():
     """With 2/3 g sin: within 1e-4 at 10 ms, and of second order in the time step."""
     x0 = embed_pose(jnp.asarray(0.1 * OUT), jnp.eye(2))

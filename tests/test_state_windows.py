@@ -91,7 +91,6 @@ def test_noise_is_measured_against_what_a_step_moves(system, exact, start):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_properties_and_potential_from_noisy_states(system, dataset, start):
     shot = estimate(start, system, STEPPER, dataset, seed=0)
     assert shot is not None

@@ -8,6 +8,7 @@ held, their windows say how well the system explains such motion.
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -123,11 +124,14 @@ def estimate(
     )
     require(system.step_model is None, "system must have no step_model to be estimated: it has no impacts of its own.")
     learned = Learned.chosen(system, learn)
-    work.say("looking for impacts", 0.0)
+    work.say("looking for impacts, and compiling for a minute or so", 0.0)
     held = _held_out(observations, test, seed)
     every = observations if test is None else Observations.concatenate([observations, test])
-    found = survey(every, bent=bool(learned.skeleton.links))
     rules: list[ImpactRule] = ["event"] if impact is None else [impact]
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(_compile, learned, rules[0], every)
+        found = survey(every, bent=bool(learned.skeleton.links))
+        compiled.result()
     first = _by_rule(learned, every, found, held, rules[0], _first_values(learned), work, (0.02, 0.98))
     if impact is None and not first.fit.explained and _at_samples(found):
         start = np.where(np.isfinite(first.theta), first.theta, _first_values(learned))
@@ -135,6 +139,14 @@ def estimate(
         first = min(first, second, key=lambda told: told.fit.chi2)
     work.say("done", 1.0)
     return first._replace(seconds=time.monotonic() - begun)
+
+
+def _compile(learned: Learned, rule: ImpactRule, every: Observations) -> None:
+    """What moves windows, while impacts are looked for."""
+    whole = np.argwhere(every.seen.all(axis=2))
+    if len(whole):
+        step = float(np.nanmedian(np.diff(every.time, axis=1)))
+        Flow(learned, rule).compile(_first_values(learned), every.x[tuple(whole[0])], step)
 
 
 def _held_out(observations: Observations, test: Observations | None, seed: int) -> Bool[np.ndarray, " N"]:
@@ -194,7 +206,6 @@ def _by_rule(
 
     few = _few(short, held)
     require(len(few) > 0, "the observations have no window with free motion to learn from.")
-    work.say(f"compiling, for a minute or two (impacts by the rule {rule!r})", begin)
     if learned.skeleton.links:
         # Between joints free motion is no parabola, by which starts were found: it is fitted first.
         free = shooting_of(short.before_impacts())

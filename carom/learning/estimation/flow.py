@@ -258,6 +258,24 @@ class Flow:
         self.rule: ImpactRule = rule
         self.thin: bool | None = None
 
+    @np.errstate(all="ignore")
+    def compile(self, theta: Float[np.ndarray, " P"], x: Float[np.ndarray, "n d"], dt: float) -> None:
+        """Compile what moves windows, by a step of `dt` (s) of a system at rest at `x` (m), recorded points.
+
+        Beside other work, in a thread: most of it does not hold up Python.
+        """
+        there, rule = jnp.asarray(theta), self.rule
+        z = np.stack([x, np.zeros_like(x)])[None]
+        thin = self._is_thin(there, z)
+        state = jnp.asarray(np.repeat(z, FREE, axis=0))
+        if self.learned.skeleton.links:
+            state = _starts(self.learned, there, state)[1]
+        _free_steps(self.learned, there, state, jnp.full(FREE, dt), rule, thin)
+        if self.learned.skeleton.contacts:
+            within, rows = _Within(self.learned.skeleton, np.asarray(state[:NEAR]), len(theta)), np.arange(NEAR)
+            within.begin(rows, np.asarray(state[:NEAR]), np.full(NEAR, dt))
+            within.move_on(self.learned, there, rows, np.asarray(state[:NEAR]), np.full(NEAR, dt), rule, thin)
+
     def _is_thin(self, theta: Array, z: Float[np.ndarray, "W 2 n d"]) -> bool:
         """Whether states may be moved along their constraints alone: these are independent, and the same for all theta.
 

@@ -1,5 +1,7 @@
 """What a training carries from step to step, and how it begins."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
