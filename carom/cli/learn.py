@@ -32,6 +32,7 @@ from carom.learning.model_file import save_model
 from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
 from carom.learning.training.devices import is_first, start_processes
 from carom.learning.training.train import LearnReport, learn, quantities
+from carom.learning.unknowns.quantities import Learned
 from carom.recordings.files import load_recording, save_recording
 from carom.recordings.recording import Recording
 from carom.tasks import make_data_sets, noisy
@@ -195,11 +196,12 @@ class Learn:
         config = dataclasses.replace(self.config, contact_model=self.config.contact_model or "coulomb")
         chosen = dataclasses.replace(chosen, system=config.prepare(chosen.system))
         names = tossed_names(chosen.system) if config.learn == LearnConfig.learn else config.learn
+        Learned.chosen(chosen.system, names)  # names of nothing are refused before a folder is made
         folder = RunFolder.choose(self.out, f"{chosen.stem}-tosses", resume=self.resume)
         if not self.resume:
             RunFolder.check_new(folder)
         train, test = self._toss_data(console, chosen)
-        settings = {**self._description(chosen), "learn": names, "tosses": dataclasses.asdict(self.tosses)}
+        settings = {**self._description(chosen), "tosses": dataclasses.asdict(self.tosses)}
         if self.resume:
             run = RunFolder.open(folder)
             run.check_same(settings)

@@ -108,7 +108,7 @@ def estimates_and_fit(report: TossReport, *, explained: bool) -> dict[str, Any]:
     estimates = []
     for name, one in report.estimates.items():
         error = np.nan if one.standard_error is None else one.standard_error
-        verdict = "misfit" if not explained else "not identified" if one.standard_error is None else "identified"
+        verdict = "misfit" if not explained else "identified" if one.told else "not identified"
         half = float(WIDTH_95 * error)
         ends = one.value - half, one.value + half
         estimates.append(Estimate(name, one.of, one.value, float(error), *ends, one.unit, verdict, None))

@@ -348,7 +348,9 @@ def _solve_batch(A, v, friction, lower, reference, settings: ConeSettings, sensi
         chosen = jax.lax.cond(jnp.any(used > 1), lambda: may_be_redundant(A, k) & (used > 1) & ~long, lambda: none)
         solution, choose = out[0], functools.partial(_choose_block, settings=settings)
         arrays = (A, v, friction, lower, reference, solution.impulse, solution.residual)
-        impulse, residual = solve_chosen(choose, arrays, chosen, LONG_BLOCK[6], (solution.impulse, solution.residual))
+        impulse, residual = solve_chosen(
+            choose, arrays, chosen, _block_size(k * d, False), (solution.impulse, solution.residual)
+        )
         out = (solution._replace(impulse=impulse, residual=residual), out[1])
     return out
 

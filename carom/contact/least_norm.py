@@ -38,7 +38,7 @@ _SINGULAR = 1e-9
 """Singular values below this share of the largest one are zero."""
 _REGULAR = 1e-6
 """Matrices whose pivots are all above this share of their diagonals have none."""
-_STILL = 1e-7
+STILL = 1e-7
 """Velocities below this share of the largest that there is, or that an impulse makes, are zero."""
 _SLOW = 0.01
 """Where the impulse is at the edge of its cone, velocities above this share of those are sliding."""
@@ -126,7 +126,7 @@ def are_redundant(
 def _held(u: Array, y: Array, mu: Array, lower: Array, *, lifts: bool) -> tuple[Allowed, Bool[Array, "K d B"]]:
     """`Y`, and the rows of the plane, with the modes of the solution `y`."""
     speed = jnp.sqrt(dot(u[:, 1:], u[:, 1:]))
-    still = _STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
+    still = STILL * jnp.maximum(jnp.max(jnp.abs(y), axis=(0, 1)), 1)
     slides = speed > still
     if lifts:
         # Programs are solved better than that: a contact slides if it is nearer to the edge of its cone than to rest.

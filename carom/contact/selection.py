@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from carom.contact.batching import as_one_batch, of_each, solve_chosen
 from carom.contact.cone_algebra import apply, matvec
-from carom.contact.least_norm import block_diagonal, least_norm, may_be_redundant, project
+from carom.contact.least_norm import STILL, block_diagonal, least_norm, may_be_redundant, project
 
 _BLOCK = 32
 _SAME = 1e-6
@@ -83,7 +83,9 @@ def _select(A, v, friction, lower, impulse, *, lifts: bool) -> Selection:
 
     one, none = jnp.ones_like(allowed.mu), jnp.zeros_like(allowed.mu)
     slip = jnp.sqrt(jnp.sum(u[:, 1:] ** 2, axis=1))
-    turns = jnp.where(allowed.slides, -1 / jnp.where(slip > 0, slip, 1), 0)
+    # Slower, the way is that of friction, and how it turns is not known.
+    fast = allowed.slides & (slip > STILL * unit)
+    turns = jnp.where(fast, -1 / jnp.where(fast, slip, 1), 0)
     across = jnp.eye(d - 1, dtype=v.dtype)[None, :, :, None] - way[:, :, None] * way[:, None]
     by_slip = jnp.stack([by(none, none, turns[:, None] * across[:, :, t]) for t in range(d - 1)], axis=2)
     V, whole, eye = least.V, block_diagonal(D), jnp.eye(k * d, dtype=v.dtype)

@@ -66,7 +66,8 @@ class LearnConfig:
     initial_restitution: float = 0.5
     """Restitution at the start."""
     contact_model: str | None = None
-    """Contact model to learn with: cm, cmr, lcp or coulomb. None: the skeleton's own (cm for the named tasks)."""
+    """Contact model to learn with: cm, cmr, lcp or coulomb. None: the skeleton's own (cm for the named tasks), and
+    coulomb for recorded tosses."""
     epsilon: float | Literal["learn"] | None = None
     """Epsilon of the contact model cmr (1/kg), or "learn" to learn it. None: the skeleton's, or 0.01."""
     compensation_steps: float | None = COMPENSATION_STEPS

@@ -5,6 +5,7 @@ grows with each. Where a long one does not fit, its short ones stay. Some trajec
 held, their windows say how well the system explains such motion.
 """
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
@@ -128,12 +129,15 @@ def estimate(
     held = _held_out(observations, test, seed)
     every = observations if test is None else Observations.concatenate([observations, test])
     rules: list[ImpactRule] = ["event"] if impact is None else [impact]
-    with ThreadPoolExecutor(1) as pool:
-        compiled = pool.submit(_compile, learned, rules[0], every)
-        found = survey(every, bent=bool(learned.skeleton.links))
+    pool = ThreadPoolExecutor(1)
+    compiled = pool.submit(_compile, learned, rules[0], every)
+    pool.shutdown(wait=False)  # what goes wrong here is said at once
+    found = survey(every, bent=bool(learned.skeleton.links))
+    if any(len(track.kinks) for track in found.tracks):
         compiled.result()
     first = _by_rule(learned, every, found, held, rules[0], _first_values(learned), work, (0.02, 0.98))
     if impact is None and not first.fit.explained and _at_samples(found):
+        work.say("compiling for a minute or so (impacts by the rule 'step')", 0.6)
         start = np.where(np.isfinite(first.theta), first.theta, _first_values(learned))
         second = _by_rule(learned, every, found, held, "step", start, work, (0.6, 0.98))
         first = min(first, second, key=lambda told: told.fit.chi2)
@@ -142,10 +146,12 @@ def estimate(
 
 
 def _compile(learned: Learned, rule: ImpactRule, every: Observations) -> None:
-    """What moves windows, while impacts are looked for."""
+    """What moves windows, while impacts are looked for. What goes wrong will do so again, where it is said."""
     whole = np.argwhere(every.seen.all(axis=2))
-    if len(whole):
-        step = float(np.nanmedian(np.diff(every.time, axis=1)))
+    if not len(whole):
+        return
+    step = float(np.nanmedian(np.diff(every.time, axis=1)))
+    with contextlib.suppress(Exception):
         Flow(learned, rule).compile(_first_values(learned), every.x[tuple(whole[0])], step)
 
 
@@ -223,7 +229,7 @@ def _by_rule(
     longer = longer._replace(start=_starts(short, short.start, longer))
     wide = shooting_of(longer)
     there = wide.at(state.theta, _starts(short, starts, longer))
-    if wide.sizes(there).after > LOST * shooting.sizes(state).after:
+    if wide.size(there) > LOST * shooting.size(state):
         # What grows without bounds has to be right at its start before it says anything of the quantities.
         each = part(0.4, 0.6, "starts of longer windows", len(REDESCENDING * 6))
         there = shoot(wide, there.theta, there.z, REDESCENDING * 6, held=True, each=each)

@@ -17,7 +17,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from carom.learning.estimation.protocols import are_elsewhere, own_points, recorded_points
 from carom.learning.unknowns.quantities import Learned
 from carom.simulation.events import closing_speed, hermite, touching
 from carom.simulation.impact import ImpactRule, Stepper, smooth_flow
@@ -172,35 +171,17 @@ def _compiled_segments() -> Callable:
 
 @eqx.filter_jit
 def _starts(learned: Learned, theta, z: Float[Array, "W 2 n d"]):
-    """Starts as they were recorded, brought onto the constraints, the same of the system's own points, and derivatives.
+    """Starts brought onto the constraints, and the derivatives of that from there.
 
-    These are where the constraints hold: elsewhere steps off these, which nothing tells, would seem to be told.
+    Elsewhere steps off the constraints, which nothing tells, would seem to be told.
     """
 
-    def own(z, theta):
+    def onto(z, theta):
         system = learned.assemble(theta)
-        x, v = own_points(system, z)
-        return jnp.stack(project_state(system.constraints, x, v, system.inverse_mass_matrix(), steps=3)), None
-
-    def one(z):
-        held = recorded_points(learned.assemble(theta), own(z, theta)[0])
-        return held, *_with_derivatives(own, every, held, theta)[:2]
+        return jnp.stack(project_state(system.constraints, z[0], z[1], system.inverse_mass_matrix(), steps=3)), None
 
     every = jnp.eye(z[0].size, dtype=z.dtype)
-    return jax.vmap(one)(z)
-
-
-@eqx.filter_jit
-def _recorded(learned: Learned, theta):
-    """The matrix that makes recorded points of the system's own, and its derivatives by theta."""
-    size = learned.skeleton.n_points * learned.skeleton.dim
-
-    def matrix(theta):
-        system = learned.assemble(theta)
-        points = jnp.eye(size).reshape(size, system.n_points, system.dim)
-        return recorded_points(system, points).reshape(size, size).T
-
-    return matrix(theta), jax.jacfwd(matrix)(theta)
+    return jax.vmap(lambda z: _with_derivatives(onto, every, onto(z, theta)[0], theta)[:2])(z)
 
 
 def _stepper(learned: Learned, dt: Float[Array, ""], rule: ImpactRule, contact: bool = True) -> Stepper:
@@ -260,7 +241,7 @@ class Flow:
 
     @np.errstate(all="ignore")
     def compile(self, theta: Float[np.ndarray, " P"], x: Float[np.ndarray, "n d"], dt: float) -> None:
-        """Compile what moves windows, by a step of `dt` (s) of a system at rest at `x` (m), recorded points.
+        """Compile what moves windows, by a step of `dt` (s) of a system at rest at `x` (m).
 
         Beside other work, in a thread: most of it does not hold up Python.
         """
@@ -269,7 +250,7 @@ class Flow:
         thin = self._is_thin(there, z)
         state = jnp.asarray(np.repeat(z, FREE, axis=0))
         if self.learned.skeleton.links:
-            state = _starts(self.learned, there, state)[1]
+            state = _starts(self.learned, there, state)[0]
         _free_steps(self.learned, there, state, jnp.full(FREE, dt), rule, thin)
         if self.learned.skeleton.contacts:
             within, rows = _Within(self.learned.skeleton, np.asarray(state[:NEAR]), len(theta)), np.arange(NEAR)
@@ -300,14 +281,14 @@ class Flow:
         size, P = z[0].size, len(theta)
         there = jnp.asarray(theta)
         thin = self._is_thin(there, z)
-        state, start = np.array(z, float), np.array(z, float)
+        state = np.array(z, float)
         slopes = np.zeros((count, size, size + P))
         slopes[:, :, :size] = np.eye(size)
         if self.learned.skeleton.links:
             for rows in _batches(np.arange(count), FREE):
                 out = _starts(self.learned, there, jnp.asarray(state[_padded(rows, FREE)]))
-                start[rows], state[rows], slopes[rows] = (np.asarray(a)[: len(rows)] for a in out)
-        half = size // 2
+                state[rows], slopes[rows] = (np.asarray(a)[: len(rows)] for a in out)
+        half, start = size // 2, state.copy()
         x = np.zeros((count, most + 1, half))
         by = np.zeros((count, most + 1, half, size + P))
         x[:, 0], by[:, 0] = state[:, 0].reshape(count, half), slopes[:, :half]
@@ -362,11 +343,6 @@ class Flow:
                 moved[:, :, size:] += own[:, :, size:]
                 commit(rows, new, moved)
                 waiting[rows] = False
-        if are_elsewhere(self.learned.skeleton):
-            matrix, by_number = map(np.asarray, _recorded(self.learned, there))
-            by = np.einsum("rq,wtqs->wtrs", matrix, by)
-            by[..., size:] += np.einsum("rqp,wtq->wtrp", by_number, x)
-            x = x @ matrix.T
         joined = [np.concatenate(parts) for parts in zip(*hits, strict=True)] if hits else None
         found = Hits(*joined) if joined else _none(P, closed.shape[1])
         return Motion(start, x, by[..., :size], by[..., size:], found)

@@ -125,21 +125,6 @@ def _middle(system: System, points):
     return jnp.einsum("a,...ad->...d", box_of(system).center, points[..., 1:, :] - points[..., :1, :])[..., None, :]
 
 
-def are_elsewhere(system: System) -> bool:
-    """Whether recorded points are not the system's own: of one tossed box."""
-    return len(system.bodies) == 1 and any(isinstance(contact, CornerPlane) for contact in system.contacts)
-
-
-def recorded_points(system: System, x: Float[Array, "... n d"]) -> Float[Array, "... n d"]:
-    """Points as they were recorded, of the system's own."""
-    return box_points(system, x) if are_elsewhere(system) else x
-
-
-def own_points(system: System, x: Float[Array, "... n d"]) -> Float[Array, "... n d"]:
-    """The inverse of `recorded_points`."""
-    return body_points(system, x) if are_elsewhere(system) else x
-
-
 def lowest_corner(system: System, x: Float[np.ndarray, "N T 4 3"]) -> Float[np.ndarray, "N T"]:
     """Height of the lowest corner above the plane (m), of recorded points; negative where it penetrates."""
     gaps = jax.jit(jax.vmap(jax.vmap(system.gaps)))(body_points(system, jnp.asarray(x)))

@@ -64,13 +64,6 @@ class State(NamedTuple):
     residual: Float[np.ndarray, "W T R"]
 
 
-class Sizes(NamedTuple):
-    """Mean squared residuals before and after impacts."""
-
-    before: float
-    after: float
-
-
 class Shooting:
     """Windows to fit.
 
@@ -122,20 +115,20 @@ class Shooting:
         """Mean squared residual of each sample; 0 where nothing was seen."""
         return np.sum(state.residual**2, axis=2) / np.maximum(self.numbers, 1)
 
-    def sizes(self, state: State) -> Sizes:
+    def sizes(self, state: State) -> tuple[float, float]:
         """What is left before and after impacts, typically: mean squared residuals, after of no less than before."""
         rows, distance = (self.numbers > 0) & self.used[:, None], self.distance(state)
         before, after = rows & self.windows.before, rows & ~self.windows.before
         if not before.any():
             size = max(1.0, float(np.median(distance[after if after.any() else self.numbers > 0])))
-            return Sizes(size, size)
-        left = float(np.median(distance[before]))
-        left = max(left, self.least if left < EXACT else 1.0)
-        return Sizes(left, max(left, float(np.median(distance[after if after.any() else before]))))
+            return size, size
+        least = float(np.median(distance[before]))
+        least = max(least, self.least) if least < EXACT else 1.0
+        return least, max(least, float(np.median(distance[after if after.any() else before])))
 
-    def of_samples(self, sizes: Sizes) -> Float[np.ndarray, "W T"]:
-        """Those of all samples."""
-        return np.where(self.windows.before, *sizes)
+    def size(self, state: State) -> float:
+        """That after impacts."""
+        return self.sizes(state)[1]
 
     def of_windows(self, state: State) -> Float[np.ndarray, " W"]:
         """Mean squared residual of each window, starts taken into account."""
@@ -148,28 +141,24 @@ class Shooting:
         ties = 0 if not system.links else int(system.constraints(jnp.asarray(self.windows.start[0, 0])).shape[0])
         return self.windows.start[0].size - 2 * ties
 
-    def weight(self, state: State, sizes: Sizes, loss: Loss) -> Float[np.ndarray, "W T"]:
-        """Weights of all samples, 1 before impacts where they fit; of plain sums of squares, of those that are `kept`.
+    def weight(self, state: State, size: float, loss: Loss) -> Float[np.ndarray, "W T"]:
+        """Weights of all samples; of plain sums of squares, of those that are `kept`.
 
-        What no quantities explain makes samples after impacts count for less, or starts would be bent to them.
+        Of these, samples after impacts count for less where no quantities explain them, or starts would be bent to them.
         """
         if loss == "squares":
             return self.kept / np.where(self.windows.before, 1.0, self.misfit)
-        size = self.of_samples(sizes)
         distance = self.distance(state) / size
         if loss == "redescending":
-            weight = (1 + distance / CUTOFF) ** -2
-        else:
-            weight = np.minimum(1, np.sqrt(2 / np.maximum(distance, 1e-30)))
-        return np.where(self.numbers > 0, weight * sizes.before / size, 0)
+            return np.where(self.numbers > 0, (1 + distance / CUTOFF) ** -2, 0)
+        return np.where(self.numbers > 0, np.minimum(1, np.sqrt(2 / np.maximum(distance, 1e-30))), 0)
 
-    def costs(self, state: State, sizes: Sizes, loss: Loss) -> Float[np.ndarray, " W"]:
+    def costs(self, state: State, size: float, loss: Loss) -> Float[np.ndarray, " W"]:
         """Sum of rho over the samples of each window."""
+        distance = self.distance(state) / size
         if loss == "squares":
-            rho = self.weight(state, sizes, loss) * self.distance(state) / sizes.before
-            return np.sum(self.numbers * rho, axis=1)
-        distance = self.distance(state) / self.of_samples(sizes)
-        if loss == "redescending":
+            rho = self.weight(state, size, loss) * distance
+        elif loss == "redescending":
             rho = distance / (1 + distance / CUTOFF)
         else:
             rho = np.where(distance < 2, distance, 2 * np.sqrt(2 * np.maximum(distance, 2)) - 2)
@@ -228,9 +217,9 @@ def shoot(
     for k, loss in enumerate(losses):
         if loss == settled:
             continue
-        sizes = shooting.sizes(state)
-        cost = shooting.costs(state, sizes, loss)
-        reduced = shooting.reduced(state, shooting.weight(state, sizes, loss), damping)
+        size = shooting.size(state)
+        cost = shooting.costs(state, size, loss)
+        reduced = shooting.reduced(state, shooting.weight(state, size, loss), damping)
         H, g = reduced.curvature[used].sum(axis=0), reduced.gradient[used].sum(axis=0)
         change = np.zeros_like(g)
         if not held and len(g):
@@ -239,12 +228,12 @@ def shoot(
                 ends = tuple(np.where(still, 0.0, end) for end in ends)
             change = newton_step(H, g, prior, change, change, *ends)
         directions, curvature, _ = spectrum(H, prior)
-        error = np.sqrt(np.sum(directions**2 / curvature, axis=1) * sizes.before)
+        error = np.sqrt(np.sum(directions**2 / curvature, axis=1) * size)
         small = bool(np.all(np.abs(change) < SETTLED * error))
         for share in 0.25 ** np.arange(4):
             move = -(share * reduced.own + reduced.follow @ (share * change))
             there = shooting.at(state.theta + share * change, state.z + move.reshape(state.z.shape))
-            now = shooting.costs(there, sizes, loss)
+            now = shooting.costs(there, size, loss)
             # At first starts have not been fitted to what comes after impacts. At last a window that no longer fits
             # counts for more than what a step wins.
             if now[used].sum() < cost[used].sum() or k == 0 or (small and not held):
@@ -257,7 +246,7 @@ def shoot(
         fallen = 1 - now[used].sum() / max(cost[used].sum(), 1e-300)
         state = there
         if each is not None:
-            each(float(np.sqrt(shooting.sizes(state).after)))
+            each(float(np.sqrt(shooting.size(state))))
         if small and (not held or fallen < SETTLED):
             settled = loss
     return state

@@ -40,12 +40,16 @@ from carom.system import System
 
 @dataclasses.dataclass(frozen=True)
 class TossEstimate:
-    """A learned number, what it is of, its unit, and its standard error by the segments (None: not told by them)."""
+    """A learned number, what it is of, its unit, and its standard error by the segments (None: there were none).
+
+    `told`: the segments tell it to half of a change that matters, and it is within its bounds.
+    """
 
     value: float
     standard_error: float | None
     of: str
     unit: str
+    told: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,6 +184,8 @@ def choose_segments(
     return chosen[np.sort(rng.permutation(len(chosen))[:count])]
 
 
+TOLD = 0.5
+"""A standard error of a larger share of a change that matters does not tell a quantity."""
 DAMPING = 1e-2
 """Curvature added for each quantity, in units of its scale and of errors of 1 mm: what no segment tells stays."""
 
@@ -240,9 +246,10 @@ def learn_tosses(
     """Learn numbers of a tossed body from recorded tosses; see the top of this file for the method.
 
     **Arguments:** `skeleton`, one rigid body whose corners meet a plane under gravity: its numbers are where the fit
-    starts; `recording`, of tosses, with velocities at the samples (`carom import poses` makes such); `learn`, names of
-    quantities as `Learned.chosen` takes them, by default `tossed_names`; `seed`, of which segments are used where there
-    are more; `run`, a folder for metrics, by which a fit that was stopped goes on.
+    starts, its contact model that of the fit; `recording`, of tosses, with velocities at the samples (`carom import
+    poses` makes such); `learn`, names of quantities as `Learned.chosen` takes them, by default `tossed_names`; `seed`,
+    of which segments are used where there are more; `run`, a folder for metrics, by which a fit that was stopped goes
+    on.
 
     **Returns:** the learned system and a report.
 
@@ -283,11 +290,21 @@ def learn_tosses(
         theta, made = _search(learned, theta, recording, config, before, log, shown)
     position, rotation = _whole(learned, theta, recording, config)
     system, seconds = learned.assemble(jnp.asarray(theta)), time.monotonic() - started
-    # What a small change of each free number does to its value.
-    values, beyond = (np.asarray(learned.physical(jnp.asarray(at))) for at in (theta, theta + 1e-3 * errors))
+    lower, upper = np.asarray(learned.lower), np.asarray(learned.upper)
+    told = (errors <= TOLD * search_steps(learned)) & (theta > lower) & (theta < upper)
+    # What a small change of each free number does to its value, one that stays within the bounds.
+    way = np.where(theta + 1e-3 * errors > upper, -1e-3, 1e-3)
+    values, beyond = (np.asarray(learned.physical(jnp.asarray(at))) for at in (theta, theta + way * errors))
+    size = np.abs(beyond - values) / 1e-3
     estimates = {
-        name: TossEstimate(float(value), abs(float(more - value)) / 1e-3 if np.isfinite(more) else None, of, unit)
-        for name, of, unit, value, more in zip(learned.names, learned.of, learned.units, values, beyond, strict=True)
+        name: TossEstimate(
+            float(values[k]),
+            float(size[k]) if np.isfinite(size[k]) else None,
+            learned.of[k],
+            learned.units[k],
+            bool(told[k]),
+        )
+        for k, name in enumerate(learned.names)
     }
     report = TossReport(estimates, float(position.mean()), float(rotation.mean()), len(position), count, made, seconds)
     return system, report

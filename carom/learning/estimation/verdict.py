@@ -119,7 +119,7 @@ def spread(shooting: Shooting, state: State, clusters: Int[np.ndarray, " W"], sh
     learned = shooting.flow.learned
     scale, lower, upper = (np.asarray(part, float) for part in (learned.scale, learned.lower, learned.upper))
     rows = np.flatnonzero(shooting.used & shooting.fits)
-    weight = shooting.weight(state, shooting.sizes(state), "squares")
+    weight = shooting.weight(state, 1.0, "squares")
     reduced = shooting.reduced(state, weight, np.zeros(len(state.z)))
     H = reduced.curvature[rows].sum(axis=0)
     at_bound = (state.theta <= lower) | (state.theta >= upper)
@@ -224,16 +224,14 @@ def _bound(shooting: Shooting, state: State, j: int, way: float) -> float | None
     end = float(np.asarray(learned.lower if way < 0 else learned.upper)[j])
     if not np.isfinite(end):
         return None
-    sizes = shooting.sizes(state)
-    allowed = float(np.sum(shooting.costs(state, sizes, "redescending")[shooting.used])) + float(
-        stats.chi2.ppf(0.95, 1)
-    )
+    size = shooting.size(state)
+    allowed = float(np.sum(shooting.costs(state, size, "redescending")[shooting.used])) + float(stats.chi2.ppf(0.95, 1))
 
     def is_worse(value: float) -> bool:
         theta = state.theta.copy()
         theta[j] = value
         there = shoot(shooting, theta, state.z, ("redescending",) * 2, held=True)
-        return float(np.sum(shooting.costs(there, sizes, "redescending")[shooting.used])) > allowed
+        return float(np.sum(shooting.costs(there, size, "redescending")[shooting.used])) > allowed
 
     if not is_worse(end):
         return None

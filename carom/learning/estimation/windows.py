@@ -15,8 +15,6 @@ from carom.learning.estimation.survey import Shape, Survey, Track, design
 
 ROOM = 3
 """Samples of free motion that a window has at least at either end."""
-RESTS = 10.0
-"""Points that are within so many errors of where they end are at rest."""
 GAP = 1.5
 """Steps longer than this many typical ones are divided."""
 
@@ -82,41 +80,16 @@ class Windows(NamedTuple):
         )
 
 
-def windows_of(found: Survey, impacts: int | None, horizon: int | None = None) -> Windows:
-    """All motions in windows of so many impacts (None: as many as there are), each of up to `horizon` samples after its
-    first one (None: up to the next window, or to where all comes to rest)."""
+def windows_of(found: Survey, impacts: int | None) -> Windows:
+    """All motions in windows of so many impacts (None: as many as there are)."""
     parts = []
     for number, track in enumerate(found.tracks):
-        moving = _moving(track, found)
         for first, last in _cuts(track, impacts):
-            kinks = track.kinks[(track.kinks >= first) & (track.kinks < last)]
-            last = min(last, moving)
-            if horizon is not None and len(kinks):
-                last = min(last, int(kinks[0]) + horizon)
-            if last - first + 1 < 2 * ROOM:
-                continue
             window = _window(found, track, number, first, last)
             if window is not None:
                 parts.append(window)
     require(bool(parts), f"the observations have no {2 * ROOM} samples in a row between impacts to learn from.")
     return Windows.concatenate(parts)
-
-
-def _moving(track: Track, found: Survey) -> int:
-    """The sample up to which a motion is looked at: some after the last that is not where it ends."""
-    x = track.x
-    off = np.linalg.norm(x - _last_seen(x), axis=2)
-    moves = np.any(off > RESTS * np.maximum(found.noise, found.floor), axis=1)
-    return min(int(np.flatnonzero(moves).max(initial=0)) + 2 * ROOM, len(x) - 1)
-
-
-def _last_seen(x: Float[np.ndarray, "T n d"]) -> Float[np.ndarray, "n d"]:
-    """Where each point was seen last."""
-    out = np.zeros(x.shape[1:])
-    for p in range(x.shape[1]):
-        rows = np.flatnonzero(np.isfinite(x[:, p, 0]))
-        out[p] = x[rows[-1], p] if len(rows) else np.nan
-    return out
 
 
 def _cuts(track: Track, impacts: int | None) -> list[tuple[int, int]]:
