@@ -144,7 +144,7 @@ class Shooting:
     def weight(self, state: State, size: float, loss: Loss) -> Float[np.ndarray, "W T"]:
         """Weights of all samples; of plain sums of squares, of those that are `kept`.
 
-        Of these, samples after impacts count for less where no quantities explain them, or starts would be bent to them.
+        Of these, samples after impacts count for less where no quantities explain them: starts would be bent to them.
         """
         if loss == "squares":
             return self.kept / np.where(self.windows.before, 1.0, self.misfit)
