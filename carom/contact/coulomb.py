@@ -220,7 +220,7 @@ def _one_round(A, v, friction, lower, reference, swept, impulse, residual, _, co
 
 
 class _Choice(NamedTuple):
-    """Impulses (N s), how far they miss the law, and which of them are those of least norm; batch first."""
+    """Impulses (N s), how far they miss the law, and which of them no further look makes less; batch first."""
 
     impulse: Float[Array, "B K d"]
     residual: Float[Array, " B"]
@@ -252,14 +252,16 @@ def _of_least_norm(A, v, friction, lower, reference, impulse, residual, _, steps
     judged = judge(problem, new).residual
     takes = scaled.finite & least.found & (judged <= _SOLVED)
     residual = jnp.asarray(jnp.where(takes, judged, residual))
-    return _Choice(scaled.outside(jnp.where(takes, new, y)), residual, (takes & (share == 1)) | ~least.singular)
+    # What was not taken would be found again, or not be found again by as many steps.
+    ends = jnp.where(takes, share == 1, least.found | (most >= max(LEAST_NORM_STEPS)))
+    return _Choice(scaled.outside(jnp.where(takes, new, y)), residual, ends | ~least.singular)
 
 
 class _Search(NamedTuple):
     """Where a batch is after some `rounds`: impulses, and how often that of least norm was looked for."""
 
     round: _Round
-    least: Bool[Array, " B"]  # the impulse is that of least norm
+    least: Bool[Array, " B"]  # the impulse is that of least norm, or none of less is found
     looks: Int[Array, " B"]
     rounds: Int[Array, ""]
 

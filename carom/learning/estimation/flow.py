@@ -57,27 +57,30 @@ class Motion(NamedTuple):
     hits: Hits
 
 
-def _with_derivatives(one: Callable, ways: Float[Array, "S m"], *at: Array):
-    """`one` of arrays, which has something beside, and its derivatives as one matrix: by the first array along `ways`,
-    by all numbers of the others."""
+def _with_derivatives(one: Callable, ways: Float[Array, "S m"] | None, *at: Array):
+    """`one` of arrays, which has something beside, and its derivatives by all their numbers as one matrix; by the first
+    array as far as it moves along `ways`, if there are some."""
     flat, unravel = ravel_pytree(at)
-    size, m = ways.shape
-    rest = len(flat) - size
-    along = jnp.zeros((m + rest, len(flat)), flat.dtype)
-    along = along.at[:m, :size].set(ways.T).at[m:, size:].set(jnp.eye(rest, dtype=flat.dtype))
+    every = jnp.eye(len(flat), dtype=flat.dtype)
+    along = every
+    if ways is not None:
+        size, m = ways.shape
+        along = jnp.zeros((m + len(flat) - size, len(flat)), flat.dtype).at[:m, :size].set(ways.T)
+        along = along.at[m:].set(every[size:])
 
     def push(t):
         return jax.jvp(lambda flat: one(*unravel(flat)), (flat,), (t,), has_aux=True)
 
     after, slopes, beside = jax.vmap(push, out_axes=(None, 0, None))(along)
-    return after, jnp.concatenate([part.reshape(len(along), -1) for part in jax.tree.leaves(slopes)], axis=1).T, beside
+    by = jnp.concatenate([part.reshape(len(along), -1) for part in jax.tree.leaves(slopes)], axis=1).T
+    if ways is not None:
+        by = jnp.concatenate([by[:, : ways.shape[1]] @ ways.T, by[:, ways.shape[1] :]], axis=1)
+    return after, by, beside
 
 
-def _ways(system: System, z: Float[Array, "2 n d"], thin: bool) -> Float[Array, "S m"]:
-    """Ways that a state can move: if `thin`, those along its constraints, of unit length and orthogonal; else all."""
+def _ways(system: System, z: Float[Array, "2 n d"]) -> Float[Array, "S m"]:
+    """Ways that a state can move along its constraints, of unit length and orthogonal."""
     flat, unravel = ravel_pytree(z)
-    if not thin:
-        return jnp.eye(len(flat), dtype=flat.dtype)
     held = _ties(system, unravel)(flat)
     return jnp.linalg.qr(held.T, mode="complete")[0][:, len(held) :]
 
@@ -111,17 +114,16 @@ def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[A
         return jnp.stack([out.x, out.v]), None
 
     def one(z, dt):
-        ways = _ways(system, z, thin)
-        after, slopes, _ = _with_derivatives(functools.partial(alone, dt), ways, z, theta)
+        after, slopes, _ = _with_derivatives(functools.partial(alone, dt), _ways(system, z) if thin else None, z, theta)
         if not system.contacts:
-            return after, slopes, ways, jnp.zeros(0, bool)
+            return after, slopes, jnp.zeros(0, bool)
         start, end = (z[0], z[1]), (after[0], after[1])
         fastest, travel = closing_speed(system, start, end) * dt, system.travel()
         shares = jnp.linspace(0, 1, PLACES + 1)
         gaps = jax.vmap(lambda s: system.gaps(hermite(start, end, dt, s * dt)[0]))(shares)
         close = jnp.min(gaps, axis=0) <= MARGIN * fastest + touching(system, z[0])
         far = (fastest > travel) & (travel > 0) & (gaps[0] <= 2 * fastest)
-        return after, slopes, ways, close | far
+        return after, slopes, close | far
 
     return jax.vmap(one)(z, dt)
 
@@ -129,8 +131,8 @@ def _free_steps(learned: Learned, theta, z: Float[Array, "B 2 n d"], dt: Float[A
 def _segments(
     learned: Learned, theta, start: Float[Array, "B 2 n d"], dt: Float[Array, " B"], now: Progress, count, rule, thin
 ):
-    """The next segments of steps: how far they are then, the derivatives of that, (x, v, left), by the state along its
-    ways, what is left and theta, and these ways. By the rule of steps a step is one segment."""
+    """The next segments of steps: how far they are then, and the derivatives of that, (x, v, left), by the state, what
+    is left and theta. By the rule of steps a step is one segment."""
     system = learned.assemble(theta)
 
     def segment(start, dt, now: Progress, count, z, left, theta):
@@ -148,9 +150,8 @@ def _segments(
     def one(start, dt, now: Progress, count):
         own = functools.partial(segment, start, dt, now, count)
         z = jnp.stack([now.x, now.v])
-        ways = _ways(system, z, thin)
-        after, slopes, end = _with_derivatives(own, ways, z, now.left, theta)
-        return end._replace(x=after[0][0], v=after[0][1]), slopes, ways
+        after, slopes, end = _with_derivatives(own, _ways(system, z) if thin else None, z, now.left, theta)
+        return end._replace(x=after[0][0], v=after[0][1]), slopes
 
     return jax.vmap(one)(start, dt, now, count)
 
@@ -180,12 +181,22 @@ def _starts(learned: Learned, theta, z: Float[Array, "W 2 n d"]):
         system = learned.assemble(theta)
         return jnp.stack(project_state(system.constraints, z[0], z[1], system.inverse_mass_matrix(), steps=3)), None
 
-    every = jnp.eye(z[0].size, dtype=z.dtype)
-    return jax.vmap(lambda z: _with_derivatives(onto, every, onto(z, theta)[0], theta)[:2])(z)
+    return jax.vmap(lambda z: _with_derivatives(onto, None, onto(z, theta)[0], theta)[:2])(z)
 
 
 def _stepper(learned: Learned, dt: Float[Array, ""], rule: ImpactRule, contact: bool = True) -> Stepper:
     return Stepper(dt=dt, impact=rule, project=bool(learned.skeleton.links), contact=contact)
+
+
+def _composed(own: Float[np.ndarray, "R s A"], before: Float[np.ndarray, "R S Q"]) -> Float[np.ndarray, "R s Q"]:
+    """Derivatives of what has its `own` by a state and by theta, and whose state has those `before`.
+
+    The last columns of both are those by theta.
+    """
+    size = before.shape[1]
+    after = own[:, :, :size] @ before
+    after[:, :, before.shape[2] - (own.shape[2] - size) :] += own[:, :, size:]
+    return after
 
 
 def _padded(rows: np.ndarray, size: int) -> np.ndarray:
@@ -219,15 +230,11 @@ class _Within:
         none = jnp.zeros(len(padded))
         now = Progress(x, v, left, acted, none > 0, none.astype(int), none, push)
         out = _compiled_segments()(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule, thin)
-        end, own, ways = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], out)
+        end, own = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], out)
         self.state[rows], self.left[rows] = np.stack([end.x, end.v], 1), end.left
         self.acted[rows], self.push[rows] = end.acted, end.push
         self.segments[rows] += 1
-        size, m = ways.shape[1:]
-        before = self.slopes[rows]
-        slopes = own[:, :, :m] @ (np.swapaxes(ways, 1, 2) @ before[:, :size]) + own[:, :, m : m + 1] * before[:, size:]
-        slopes[:, :, size:] += own[:, :, m + 1 :]
-        self.slopes[rows] = slopes
+        self.slopes[rows] = _composed(own, self.slopes[rows])
         return rows[~(end.left > 0)]
 
 
@@ -317,15 +324,12 @@ class Flow:
                     self.rule,
                     thin,
                 )
-                new, own, ways, near = (np.asarray(a)[: len(rows)] for a in out)
+                new, own, near = (np.asarray(a)[: len(rows)] for a in out)
                 touch = near.any(axis=1)
                 waiting[rows[touch]], closed[rows[touch]] = True, near[touch]
                 alone[rows[touch]] = new[touch, 1].reshape(-1, half)
                 within.begin(rows[touch], state, steps[rows[touch], at[rows[touch]]])
-                m, free = ways.shape[2], rows[~touch]
-                moved = own[~touch][:, :, :m] @ (np.swapaxes(ways[~touch], 1, 2) @ slopes[free])
-                moved[:, :, size:] += own[~touch][:, :, m:]
-                commit(free, new[~touch], moved)
+                commit(rows[~touch], new[~touch], _composed(own[~touch], slopes[rows[~touch]]))
             queue = np.flatnonzero(waiting)
             if not len(queue) and not len(going):
                 break
@@ -339,9 +343,7 @@ class Flow:
                 if hit.any():
                     strength = _strength(own[hit][:, :, size:], steps[rows, at[rows]][hit])
                     hits.append((rows[hit], at[rows][hit], jump[hit], strength, closed[rows][hit]))
-                moved = own[:, :, :size] @ slopes[rows]
-                moved[:, :, size:] += own[:, :, size:]
-                commit(rows, new, moved)
+                commit(rows, new, _composed(own, slopes[rows]))
                 waiting[rows] = False
         joined = [np.concatenate(parts) for parts in zip(*hits, strict=True)] if hits else None
         found = Hits(*joined) if joined else _none(P, closed.shape[1])

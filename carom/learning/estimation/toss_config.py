@@ -36,12 +36,14 @@ class TossConfig:
 
     horizons: tuple[int, ...] = (8, 16)
     """Samples that segments of tosses around impacts are predicted over, one stage after the other."""
-    segments: int = 1000
+    segments: int = 400
     """Most segments in a stage."""
     toss_rounds: int = 5
     """Gauss-Newton steps in each stage."""
     evaluations: int = 60
     """Most evaluations of whole tosses at the end; 0: leave it at the segments."""
+    toss_count: int = 88
+    """Most whole tosses that are fitted at the end; more take longer."""
     toss_samples: int = 120
     """Samples of a toss that are fitted at the end: bodies rest after that."""
     substeps: int = 1
@@ -49,7 +51,7 @@ class TossConfig:
 
     def check(self) -> None:
         """Raise `CaromError` for a value that cannot be."""
-        for name in ("segments", "toss_rounds", "toss_samples", "substeps"):
+        for name in ("segments", "toss_rounds", "toss_count", "toss_samples", "substeps"):
             require(getattr(self, name) >= 1, f"{name} must be at least 1; it was {getattr(self, name)}.")
         require(self.evaluations >= 0, f"evaluations must not be negative; it was {self.evaluations}.")
         require(all(h >= 2 for h in self.horizons), f"horizons must be at least 2 samples; they were {self.horizons}.")
