@@ -1,6 +1,7 @@
 """The estimator against motions that carom did not make: flights in closed form, impacts at their own time."""
 
 import json
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -25,11 +26,28 @@ TRUE = Pucks(friction=(0.17, 0.08), restitution=(0.82, 0.65), field=(0.1, -0.3))
 LEARN = ("friction", "restitution", "mass", "gravity", "radius:1", "plane:1")
 
 
-def box(pucks: Pucks) -> carom.System:
+class Frame(NamedTuple):
+    """Where and in which units something is told: `unit turn @ x + shift`, masses times `heavy`."""
+
+    turn: np.ndarray = np.eye(2)
+    shift: np.ndarray = np.zeros(2)
+    unit: float = 1.0
+    heavy: float = 1.0
+
+    def of(self, x):
+        return self.unit * np.asarray(x) @ self.turn.T + self.shift
+
+
+HERE = Frame()
+
+
+def box(pucks: Pucks, frame: Frame = HERE) -> carom.System:
     """What is told of the pucks: radii, walls, the first mass; the second radius and a wall a little wrong."""
     walls = [((0.0, 0.0), (1.0, 0.0)), ((1.002, 0.0), (-1.0, 0.0)), ((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (0.0, -1.0))]
+    walls = [(frame.of(point), frame.turn @ normal) for point, normal in walls]
+    radii = pucks.radii[0], pucks.radii[1] - 1e-3
     return carom.System(
-        [carom.PointMass(pucks.masses[0], pucks.radii[0]), carom.PointMass(pucks.masses[0], pucks.radii[1] - 1e-3)],
+        [carom.PointMass(frame.heavy * pucks.masses[0], frame.unit * radius) for radius in radii],
         contacts=[carom.DiskDisk([(0, 1)])] + [carom.DiskPlane([0, 1], *wall, property=1) for wall in walls],
         friction=[0.3, 0.3],
         restitution=[0.5, 0.5],
@@ -201,6 +219,31 @@ def test_noisy_positions_with_gaps_give_intervals_that_hold(exact):
     assert np.sum(np.abs(off) > 2.1) <= 2
     half = {one.name: (one.upper - one.lower) / 2 for one in told.estimates}
     assert max(half[name] for name in ("restitution:0", "restitution:1", "friction:0", "friction:1")) < 0.005
+
+
+@pytest.mark.slow
+def test_what_is_told_hangs_on_no_frame_and_no_unit():
+    world = observe(TRUE, trajectories=40, samples=80, noise=2e-4, missing=0.2, seed=5)
+    turned = Rotation.from_euler("z", 0.7).as_matrix()[:2, :2] @ np.diag([1.0, -1.0])
+    frame = Frame(turned, np.array([300.0, -2000.0]), unit=1e3, heavy=1e-3)
+    here = estimate(box(TRUE), seen(world), LEARN)
+    there = estimate(box(TRUE, frame), Observations.checked(frame.of(world.x), world.time), LEARN)
+    one, other = ({name: getattr(told, name) for name in ("theta", "covariance")} for told in (here, there))
+    names = [estimate.name for estimate in here.estimates]
+    sizes = np.array([frame.unit if name.startswith(("gravity", "radius", "plane")) else 1.0 for name in names])
+    turn = np.eye(len(names))
+    field = [names.index("gravity:x"), names.index("gravity:y")]
+    turn[np.ix_(field, field)] = turned
+    # The wall goes with the frame's origin.
+    one["theta"][names.index("plane:1")] += (turned @ [-1.0, 0.0]) @ frame.shift / frame.unit
+    error = np.sqrt(np.diag(there.covariance))
+    assert here.fit.explained
+    assert np.all(np.abs(other["theta"] - sizes * (turn @ one["theta"])) < 1e-3 * error)
+    # Errors of the field are the greater of two by each axis, so that they turn only nearly with the frame.
+    rest = np.array([not name.startswith("gravity") for name in names])
+    expected = (sizes * np.sqrt(np.diag(one["covariance"])))[rest]
+    np.testing.assert_allclose(error[rest], expected, rtol=1e-3)
+    np.testing.assert_allclose(there.fit.chi2, here.fit.chi2, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -50,7 +50,6 @@ def started_off(system, by=0.05):
 
 
 @pytest.mark.slow
-@pytest.mark.ci_budget
 def test_sliding_impacts_identify_and_a_contact_never_touched_is_not():
     truth = ball()
     found = identify(started_off(truth), throws(truth, 40, along=4.0), learned=CONTACT)

@@ -34,6 +34,7 @@ from carom.learning.estimation.verdict import (
     telling,
 )
 from carom.learning.estimation.windows import Windows, windows_of
+from carom.learning.unknowns.body_quantities import length_of
 from carom.learning.unknowns.quantities import Learned
 from carom.recordings.observations import Observations
 from carom.simulation.impact import ImpactRule
@@ -53,6 +54,8 @@ LONG: tuple[Loss, ...] = REDESCENDING * 4
 LAST: tuple[Loss, ...] = ("squares",) * 3
 FEW = 150
 """Windows that the first steps are taken with, while quantities are far off: more of them do not make these better."""
+FIELD = 0.1
+"""A change of a uniform field that matters, as a share of what turns motion around within the length of a body."""
 AT_SAMPLES = 0.05
 """Kinks that are within so much of a step of a sample are at it."""
 
@@ -124,7 +127,7 @@ def estimate(
         f"the observations have {shape[0]} points in {shape[1]}D; the system has {system.n_points} in {system.dim}D.",
     )
     require(system.step_model is None, "system must have no step_model to be estimated: it has no impacts of its own.")
-    learned = Learned.chosen(system, learn)
+    learned = Learned.chosen(system, learn).with_field_scale(FIELD * _speed(observations) ** 2 / length_of(system))
     work.say("looking for impacts, and compiling for a minute or so", 0.0)
     held = _held_out(observations, test, seed)
     every = observations if test is None else Observations.concatenate([observations, test])
@@ -143,6 +146,13 @@ def estimate(
         first = min(first, second, key=lambda told: told.fit.chi2)
     work.say("done", 1.0)
     return first._replace(seconds=time.monotonic() - begun)
+
+
+def _speed(observations: Observations) -> float:
+    """Half of the steps between samples are faster (m/s); 0 where no two follow each other."""
+    ways = np.linalg.norm(np.diff(observations.x, axis=1), axis=-1)
+    speeds = (ways / np.diff(observations.time, axis=1)[..., None])[np.isfinite(ways)]
+    return float(np.median(speeds)) if len(speeds) else 0.0
 
 
 def _compile(learned: Learned, rule: ImpactRule, every: Observations) -> None:

@@ -40,7 +40,7 @@ class TossConfig:
     """Most segments in a stage."""
     toss_rounds: int = 5
     """Gauss-Newton steps in each stage."""
-    evaluations: int = 60
+    evaluations: int = 32
     """Most evaluations of whole tosses at the end; 0: leave it at the segments."""
     toss_count: int = 88
     """Most whole tosses that are fitted at the end; more take longer."""

@@ -11,9 +11,10 @@ from fnmatch import fnmatchcase
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from carom.checks import require
+from carom.checks import as_floats, require
 from carom.errors import CaromError
 from carom.learning.unknowns.body_quantities import (
     force_quantities,
@@ -109,6 +110,22 @@ class Learned(eqx.Module):
         _check_parts(groups)
         uses_field = any(q.label.kind.startswith("gravity") for group in groups for q in group)
         return cls(skeleton if uses_field else system, groups, tuple(name for name, _ in chosen))
+
+    def with_field_scale(self, acceleration: float) -> "Learned":
+        """With this change (m/s^2) of a uniform field for one that matters, or a hundredth of the field, if more.
+
+        How strong a field may be that nobody told is known by what moves in it.
+        """
+        fields = [q for q in quantities(self.skeleton) if q.label.kind == "gravity"]
+        told = np.linalg.norm([float(q.value(self.skeleton)) for q in fields])
+        scale = max(acceleration, 0.01 * told)
+
+        def scaled(quantity: Quantity) -> Quantity:
+            if not (quantity.label.kind.startswith("gravity") and scale > 0):
+                return quantity
+            return eqx.tree_at(lambda q: q.scale, quantity, as_floats(scale))
+
+        return Learned(self.skeleton, tuple(tuple(map(scaled, group)) for group in self.groups), self.names)
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
