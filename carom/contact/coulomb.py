@@ -252,8 +252,8 @@ def _of_least_norm(A, v, friction, lower, reference, impulse, residual, _, steps
     judged = judge(problem, new).residual
     takes = scaled.finite & least.found & (judged <= _SOLVED)
     residual = jnp.asarray(jnp.where(takes, judged, residual))
-    # What was not taken would be found again, or not be found again by as many steps.
-    ends = jnp.where(takes, share == 1, least.found | (most >= max(LEAST_NORM_STEPS)))
+    # What most of the steps did not find, or what was not taken then, would be so again.
+    ends = jnp.where(takes, share == 1, most >= max(LEAST_NORM_STEPS))
     return _Choice(scaled.outside(jnp.where(takes, new, y)), residual, ends | ~least.singular)
 
 

@@ -48,12 +48,12 @@ LCP_NOTE = (
     "and Poisson's restitution where the LCP has pyramids and Newton's: for cp3, in 2D and without restitution, the "
     "same. The cells of gyro that are worse are what this makes in 3D: after the same impacts the two models' "
     "velocities are 2.7 % of the jump apart (median; 3.3 % in the mean), 1.5 % with pyramids of 32 edges, .7 % without "
-    "restitution, .03 % with both, and nothing without friction (`python -m benchmarks.laws_of_gyro`). So half of it "
-    "is the pyramid, and half Newton's restitution, which with friction is not Poisson's; learned with the LCP itself, "
-    "the same data give friction, restitution and predictions to 1e-5 and better. Predictions on CM data are made with "
-    "CM, but for what was learned with the LCP: there they show how far the two are apart. Other readings, not "
-    "counted: learned with CM, which with friction cannot be right, and with the LCP itself, whose gradients were NaN "
-    "in the paper."
+    "restitution, .03 % with both, and nothing without friction (`python -m benchmarks.laws_of_gyro`). So Newton's "
+    "restitution, which with friction is not Poisson's, alone makes 1.5 %, and the pyramid alone .7 %; learned with "
+    "the LCP itself, the same data give friction, restitution and predictions to 1e-5 and better. Predictions on CM "
+    "data are made with CM, but for what was learned with the LCP: there they show how far the two are apart. Other "
+    "readings, not counted: learned with CM, which with friction cannot be right, and with the LCP itself, whose "
+    "gradients were NaN in the paper."
 )
 LCP_READINGS = {"": "coulomb", ", learned with CM": "cm", ", learned with LCP": "lcp"}
 """How LCP data are learned, by the end of a row's name; the first is counted."""

@@ -8,6 +8,7 @@ held, their windows say how well the system explains such motion.
 import contextlib
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -34,7 +35,6 @@ from carom.learning.estimation.verdict import (
     telling,
 )
 from carom.learning.estimation.windows import Windows, windows_of
-from carom.learning.unknowns.body_quantities import length_of
 from carom.learning.unknowns.quantities import Learned
 from carom.recordings.observations import Observations
 from carom.simulation.impact import ImpactRule
@@ -54,8 +54,8 @@ LONG: tuple[Loss, ...] = REDESCENDING * 4
 LAST: tuple[Loss, ...] = ("squares",) * 3
 FEW = 150
 """Windows that the first steps are taken with, while quantities are far off: more of them do not make these better."""
-FIELD = 0.1
-"""A change of a uniform field that matters, as a share of what turns motion around within the length of a body."""
+FIELD = 0.05
+"""A change of a uniform field that matters, as a share of what turns motion around within its own extent."""
 AT_SAMPLES = 0.05
 """Kinks that are within so much of a step of a sample are at it."""
 
@@ -127,7 +127,7 @@ def estimate(
         f"the observations have {shape[0]} points in {shape[1]}D; the system has {system.n_points} in {system.dim}D.",
     )
     require(system.step_model is None, "system must have no step_model to be estimated: it has no impacts of its own.")
-    learned = Learned.chosen(system, learn).with_field_scale(FIELD * _speed(observations) ** 2 / length_of(system))
+    learned = Learned.chosen(system, learn).with_field_scale(_field_scale(system, observations))
     work.say("looking for impacts, and compiling for a minute or so", 0.0)
     held = _held_out(observations, test, seed)
     every = observations if test is None else Observations.concatenate([observations, test])
@@ -148,11 +148,24 @@ def estimate(
     return first._replace(seconds=time.monotonic() - begun)
 
 
-def _speed(observations: Observations) -> float:
-    """Half of the steps between samples are faster (m/s); 0 where no two follow each other."""
-    ways = np.linalg.norm(np.diff(observations.x, axis=1), axis=-1)
-    speeds = (ways / np.diff(observations.time, axis=1)[..., None])[np.isfinite(ways)]
-    return float(np.median(speeds)) if len(speeds) else 0.0
+def _field_scale(system: System, observations: Observations) -> float:
+    """A change of a uniform field (m/s^2) that matters: a share of what turns motion around within its extent.
+
+    Speeds are those of centres, over a twentieth of the samples, so that noise adds little; of bodies that move, as
+    most may rest. 0 where nothing was seen to move.
+    """
+    x = observations.x[:, :, list(system.table.center)]
+    lag = max(1, x.shape[1] // 20)
+    speeds = [
+        np.linalg.norm(x[:, k:] - x[:, :-k], axis=-1)
+        / (observations.time[:, k:] - observations.time[:, :-k])[..., None]
+        for k in (lag, lag + 1)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of bodies that were never seen twice
+        speed = np.nanquantile(np.nanquantile(np.concatenate(speeds, axis=1), 0.9, axis=1), 0.9)
+        spread = np.nanmean(np.sum((x - np.nanmean(x, axis=(0, 1, 2))) ** 2, axis=-1))
+    return float(FIELD * speed**2 / (2 * np.sqrt(spread))) if speed > 0 and spread > 0 else 0.0
 
 
 def _compile(learned: Learned, rule: ImpactRule, every: Observations) -> None:

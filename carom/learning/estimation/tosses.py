@@ -86,7 +86,7 @@ IMPACT: ImpactRule = "event"
 """Contacts act when they close, which needs no small steps."""
 EVENTS = 4
 """Times at which a step is cut at most: corners of a box that comes to rest chatter, in some steps more than 20 times,
-by less than can be seen, and all tosses of a batch wait for the one that does."""
+and all tosses of a batch wait for the one that does."""
 
 
 def toss_stepper(dt: float, substeps: int = 1) -> Stepper:
