@@ -4,6 +4,7 @@
 the joints' anchors meet.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -12,9 +13,12 @@ from jaxtyping import Float
 
 from carom.checks import require
 from carom.mechanics.bodies import RigidBody, embed_pose, embed_velocity
-from carom.mechanics.constraints import Angles, Constraint, Joint, Pivot, Track, place_weights
+from carom.mechanics.constraints import Constraint, Joint, Pivot, Track, place_weights
+from carom.mechanics.joints import JointKind, Joints
 
-FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
+KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # mjtJoint
+MEET = 1e-6
+"""Axes that are nearer to each other than this (m) go through one point."""
 SPHERE, BOX = 2, 6  # mjtGeom
 POINTS = 4
 """Points of a rigid body in 3D."""
@@ -166,89 +170,63 @@ def state_of(
 # --- joints ---------------------------------------------------------------------------------------
 
 
-def joints_of(model: Any, data: Any, groups: dict[int, Group]) -> list[Constraint]:
-    """What holds each body to its parent.
+def joints_of(model: Any, data: Any, groups: dict[int, Group]) -> list[Joints]:
+    """The joints between each body and its parent, in the order of MuJoCo's degrees of freedom.
 
-    **Raises:** `CaromError` for joints of one body that are not slides followed by hinges through one point.
+    **Raises:** `CaromError` for joints of one body that are not up to three slides and three hinges, or a ball.
     """
     found = []
     for group in groups.values():
         if group.number is not None:
             parent = groups[int(model.body_weldid[model.body_parentid[group.root]])]
             start = int(model.body_jntadr[group.root])
-            joints = list(range(start, start + int(model.body_jntnum[group.root])))
-            if model.jnt_type[joints[0]] != FREE:
-                found += _held(model, data, group, parent, joints)
+            found.append(_joints(model, data, group, parent, range(start, start + int(model.body_jntnum[group.root]))))
     return found
 
 
-def _held(model: Any, data: Any, group: Group, parent: Group, joints: list[int]) -> list[Constraint]:
-    types = [int(model.jnt_type[joint]) for joint in joints]
-    slides = [joint for joint, kind in zip(joints, types, strict=True) if kind == SLIDE]
-    turns = [joint for joint, kind in zip(joints, types, strict=True) if kind != SLIDE]
-    name = f"body '{group.name}'"
-    require(
-        joints == slides + turns,
-        f"{name} has the slide joint {name_of(model, 'joint', slides[-1] if slides else 0)} after a hinge or ball "
-        "joint, so that its direction turns; carom has slides that are fixed in the parent. Put the slide first, or "
-        "give it a body of its own.",
-    )
-    require(
-        len(turns) == 1 or all(model.jnt_type[joint] == HINGE for joint in turns),
-        f"{name} has a ball joint and other joints that turn it. Remove these: a ball joint allows all rotations.",
-    )
-    anchors, axes = data.xanchor[turns], data.xaxis[turns]
-    require(
-        bool(np.ptp(anchors, axis=0).max(initial=0) < 1e-6) if turns else True,
-        f"{name} has the hinges {', '.join(name_of(model, 'joint', j) for j in turns)}, which do not meet in one "
-        "point. Move them there, or give each a body of its own.",
-    )
-    for what, rows in (("hinges", axes), ("slides", data.xaxis[slides])):
+def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence[int]) -> Joints:
+    assert group.first is not None
+    kinds = [KINDS[int(model.jnt_type[joint])] for joint in joints]
+    hinges, slides, balls = (kinds.count(kind) for kind in ("hinge", "slide", "ball"))
+    for kind, most in (("hinge", 3), ("slide", 3), ("ball", 1)):
+        rows = np.array([data.xaxis[j] for j, k in zip(joints, kinds, strict=True) if k == kind])
         require(
-            np.linalg.matrix_rank(rows, tol=1e-6) == len(rows) if len(rows) else True,
-            f"{name} has {len(rows)} {what} whose axes are not independent. Remove those that add no freedom.",
+            len(rows) <= most and (kind == "ball" or len(rows) < 2 or np.linalg.matrix_rank(rows, tol=1e-6) == len(rows)),
+            f"body '{group.name}' has {len(rows)} {kind}s whose axes are not independent. Remove those that add no "
+            "freedom.",
         )
-    point = anchors[0] if turns else group.place
-    free_turns = 3 if turns and model.jnt_type[turns[0]] == BALL else len(turns)
-    return [*_positions(group, parent, point, data.xaxis[slides]), *_rotations(group, parent, axes, free_turns)]
-
-
-def _complement(rows: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "e 3"]:
-    """Unit directions at right angles to `rows` and to each other."""
-    return np.eye(3) if len(rows) == 0 else np.linalg.svd(rows)[2][len(rows) :]
-
-
-def _positions(group: Group, parent: Group, point, slides) -> list[Constraint]:
-    """The point of the body stays at that of its parent, but for the slides."""
-    assert group.first is not None
-    weights = place_weights(group.local(point))
-    if len(slides) == 3:
-        return []
-    if len(slides):
-        normals = parent.directions(_complement(slides))
-        return [Track(group.first, weights, normals, parent.local(point), parent.first)]
-    if parent.first is None:
-        return [Joint(group.first, weights, point)]
-    return [Pivot(group.first, weights, parent.first, place_weights(parent.local(point)))]
-
-
-def _rotations(group: Group, parent: Group, axes, free_turns: int) -> list[Constraint]:
-    """Directions that keep their angles: three, two for a hinge, one for two hinges.
-
-    The first of two hinges is fixed in the parent and the second in the body; they keep their angle.
-    """
-    assert group.first is not None
-    if free_turns == 3:
-        return []
-    if free_turns == 2:
-        own, others = axes[1:], axes[:1]
-    elif free_turns == 1:
-        others = _complement(axes)
-        own = np.repeat(axes, 2, axis=0)
-    else:
-        own, others = np.eye(3), np.roll(np.eye(3), -1, axis=0)
-    cosines = np.sum(own * others, axis=1)
-    return [Angles(group.first, group.directions(own), parent.directions(others), cosines, parent.first)]
+    require(
+        not (balls and hinges),
+        f"body '{group.name}' has a ball joint and hinges. Remove these: a ball joint allows all rotations.",
+    )
+    turning = [data.xanchor[j] for j, kind in zip(joints, kinds, strict=True) if kind != "slide"]
+    point = turning[0] if turning else group.place
+    meet = bool(np.ptp(turning, axis=0).max() < MEET) if turning else True
+    anchors = [
+        point if kind == "slide" or meet else data.xanchor[j] for j, kind in zip(joints, kinds, strict=True)
+    ]
+    rest, near = [], []
+    for joint, kind in zip(joints, kinds, strict=True):
+        at = int(model.jnt_qposadr[joint])
+        if kind in ("hinge", "slide"):
+            rest.append(float(model.qpos0[at]))
+            near.append(float(np.mean(model.jnt_range[joint])) if model.jnt_limited[joint] else rest[-1])
+        else:
+            values = [0.0] * 3 if kind == "ball" else [*map(float, model.qpos0[at : at + 3]), 0.0, 0.0, 0.0]
+            rest, near = rest + values, near + values
+    return Joints(
+        group.first,
+        parent.first,
+        kinds,
+        [group.directions(data.xaxis[j]) for j in joints],
+        [group.local(anchor) for anchor in anchors],
+        parent.local(anchors[0]),
+        parent.axes.T @ group.axes,
+        rest,
+        near,
+        data.xmat[group.root].reshape(3, 3).T @ group.axes,
+        [name_of(model, "joint", joint).strip("'") for joint in joints],
+    )
 
 
 # --- loops ----------------------------------------------------------------------------------------
