@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -22,6 +22,9 @@ from carom.mechanics.bodies import (
     total_mass_matrix,
 )
 from carom.mechanics.constraints import Constraint, Rigid
+from carom.mechanics.dynamics import lagrangian_field
+from carom.mechanics.forces import Actuators, Coordinates, Force, Rotors, signal_of
+from carom.mechanics.joints import Joints
 from carom.mechanics.potentials import NoPotential, Potential
 
 Compensation = Literal["mass", "paper"]
@@ -45,11 +48,13 @@ class System(eqx.Module):
     **Arguments:**
 
     - `bodies`: `PointMass` and `RigidBody` objects; their points are stacked in this order into `x` (n, d).
-    - `constraints`: `Distance`, `Tether`, `Joint`, `Pivot`, `Angles`, `Track` objects between points; a rigid body's
-      own are added.
+    - `constraints`: `Joints`, `Distance`, `Tether`, `Joint`, `Pivot`, `Angles`, `Track` objects between points; a rigid
+      body's own are added. The coordinates of the system's joints are those of its `Joints`, in this order.
     - `contacts`: `DiskDisk`, `DiskPlane`, `RimPlane`, `CornerPlane`, `BallPlane`, `BallBall`, `BendLimit`,
       `StretchLimit` objects; those without a contact are left out.
     - `potential`: a `Potential`, such as `Gravity((0., -9.81))`; none by default.
+    - `forces`: `JointSpring`, `JointDamping`, `Actuators`, `BodyDrag` and other forces; one `Actuators` at most.
+    - `rotors`: inertias behind gears, or the armature (q,) of each coordinate of the joints (kg m^2, kg).
     - `friction`, `restitution`: contact properties (P,), Coulomb's mu >= 0 and Poisson's e in [0, 1]. A contact refers
       to them by its `property` index; a single number is shared by all.
     - `max_active`: how many contacts can be closed at once (the solver's size). By default as many as there are
@@ -73,6 +78,8 @@ class System(eqx.Module):
     links: tuple[Constraint, ...]
     contacts: tuple[Contact, ...]
     potential: Potential
+    forces: tuple[Force, ...]
+    rotors: Rotors | None
     friction: Float[Array, " P"]
     restitution: Float[Array, " P"]
     contact_model: ContactModel
@@ -91,6 +98,8 @@ class System(eqx.Module):
         friction: ArrayLike | Sequence[float] = 0.0,
         restitution: ArrayLike | Sequence[float] = 0.0,
         *,
+        forces: Sequence[Force] = (),
+        rotors: Rotors | ArrayLike | None = None,
         contact_model: str | ContactModel = "coulomb",
         compensation: Compensation = "mass",
         step_model: StepModel | None = None,
@@ -119,6 +128,15 @@ class System(eqx.Module):
                 all(0 <= p < table.n_points for p in link.points()),
                 f"{type(link).__name__} refers to the points {link.points()}, but the system has {table.n_points} "
                 f"(0 to {table.n_points - 1}).",
+            )
+        self.forces, self.rotors = tuple(forces), self._rotors(rotors)
+        motors = [force for force in self.forces if isinstance(force, Actuators)]
+        require(len(motors) <= 1, f"forces may hold one Actuators object; they held {len(motors)}. Join them.")
+        for motor in motors:
+            require(
+                motor.gears.shape[1] == self.n_coordinates,
+                f"Actuators gears must have a column for each of {self.n_coordinates} coordinates of joints; they had "
+                f"{motor.gears.shape[1]}.",
             )
         for contact in self.contacts:
             used = [b for bodies in contact.bodies_of() for b in bodies]
@@ -153,6 +171,24 @@ class System(eqx.Module):
         **Raises:** `CaromError` for an unknown one.
         """
         return self._with("compensation", _compensation_of(compensation))
+
+    def _rotors(self, rotors) -> Rotors | None:
+        if rotors is None or isinstance(rotors, Rotors):
+            found = rotors
+        else:
+            armature = np.asarray(rotors, float)
+            require(
+                armature.shape == (self.n_coordinates,) and bool(np.all(armature >= 0)),
+                f"rotors must be Rotors, or zero or positive armatures of {self.n_coordinates} coordinates of joints; "
+                f"they were {armature.tolist()}.",
+            )
+            there = np.flatnonzero(armature)
+            found = Rotors(np.eye(len(armature))[there], armature[there]) if len(there) else None
+        require(
+            found is None or found.gears.shape[1] == self.n_coordinates,
+            f"rotors must have a column of gears for each of {self.n_coordinates} coordinates of joints.",
+        )
+        return found
 
     def _with(self, name: str, value) -> "System":
         new = object.__new__(System)
@@ -195,6 +231,83 @@ class System(eqx.Module):
     def _property_index(self) -> np.ndarray:
         return np.array([p for contact in self.contacts for p in contact.property_index], dtype=int)
 
+    # --- joints -----------------------------------------------------------------------------------------------
+
+    @property
+    def joints(self) -> tuple[Joints, ...]:
+        """The joints among the constraints."""
+        return tuple(link for link in self.links if isinstance(link, Joints))
+
+    @property
+    def n_coordinates(self) -> int:
+        """Number of coordinates q of all joints."""
+        return sum(joint.count for joint in self.joints)
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(name for joint in self.joints for name in joint.coordinate_names())
+
+    @property
+    def actuators(self) -> Actuators | None:
+        """Its motors, if it has some."""
+        return next((force for force in self.forces if isinstance(force, Actuators)), None)
+
+    def joint_positions(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t q"]:
+        """Coordinates of the joints (rad, m) of a state, or of states along leading axes, see `Joints`.
+
+        Along the last of these, which is time, angles of hinges go on over full turns.
+        """
+        if x.ndim > 2:
+            q = jax.vmap(self.joint_positions)(x)
+            hinges = np.array([is_hinge for joint in self.joints for is_hinge in joint.is_hinge()], bool)
+            return jnp.where(hinges, jnp.unwrap(q, axis=-2), q) if x.ndim == 3 and q.shape[-1] else q
+        return jnp.concatenate([joint.coordinates(x) for joint in self.joints] or [jnp.zeros(0, x.dtype)])
+
+    def joint_velocities(self, x: Float[Array, "*t n d"], v: Float[Array, "*t n d"]) -> Float[Array, "*t q"]:
+        """Rates of the joints' coordinates (rad/s, m/s); of balls and free bodies, angular velocities."""
+        if x.ndim > 2:
+            return jax.vmap(self.joint_velocities)(x, v)
+        return jnp.concatenate([joint.rates(x, v) for joint in self.joints] or [jnp.zeros(0, x.dtype)])
+
+    def state_from_joints(
+        self, q: Float[Array, "*t q"], rates: Float[Array, "*t q"] | None = None
+    ) -> tuple[Float[Array, "*t n d"], Float[Array, "*t n d"]]:
+        """Positions (m) and velocities (m/s) of the points where the joints have these coordinates and rates.
+
+        **Raises:** `CaromError` for shapes that do not fit, and for a body that no joint holds.
+        """
+        q = jnp.asarray(q)
+        rates = jnp.zeros_like(q) if rates is None else jnp.asarray(rates)
+        count = self.n_coordinates
+        require(
+            q.shape == rates.shape and q.shape[-1:] == (count,),
+            f"q and rates must have {count} coordinates of joints in their last axis; their shapes were {q.shape} and "
+            f"{rates.shape}.",
+        )
+        if q.ndim > 1:
+            return jax.vmap(self.state_from_joints)(q, rates)
+
+        def points(change):
+            poses, first = {None: (jnp.eye(self.dim, dtype=q.dtype), jnp.zeros(self.dim, q.dtype))}, 0
+            spans = {}
+            for joint in self.joints:
+                spans[joint.i] = joint, slice(first, first + joint.count)
+                first += joint.count
+            missing = [k for k, center in enumerate(self.table.center) if center not in spans]
+            require(not missing, f"state_from_joints needs joints for every body; the bodies {missing} have none.")
+
+            def pose(i):
+                if i not in poses:
+                    joint, span = spans[i]
+                    poses[i] = joint.pose(q[span], *pose(joint.j), change[span])
+                return poses[i]
+
+            parts = [pose(i) for i in self.table.center]
+            return jnp.concatenate([jnp.concatenate([place[None], place + turn.T]) for turn, place in parts])
+
+        return jax.jvp(points, (jnp.zeros_like(q),), (rates,))
+
     # --- mechanics --------------------------------------------------------------------------------------------
 
     def mass_matrix(self) -> Float[Array, "n n"]:
@@ -206,18 +319,90 @@ class System(eqx.Module):
         return total_inverse_mass_matrix(self.bodies, self.dim)
 
     def kinetic_energy(self, v: Float[Array, "n d"]) -> Float[Array, ""]:
-        """`1/2 v^T M v` (J)."""
+        """`1/2 v^T M v` (J) of the bodies; rotors have their own."""
         return jnp.sum(v * (self.mass_matrix() @ v)) / 2
 
+    def rotor_energy(self, x: Float[Array, "n d"], v: Float[Array, "n d"]) -> Float[Array, ""]:
+        """Kinetic energy (J) of the rotors."""
+        if self.rotors is None:
+            return jnp.zeros((), x.dtype)
+        return jnp.sum(self.rotors.inertia * self.rotor_rates(x, v) ** 2) / 2
+
+    @property
+    def rotor_terms(self) -> tuple[Callable, Float[Array, " r"]] | None:
+        """What the equations of motion need of the rotors: `rotor_rates` and inertias."""
+        return None if self.rotors is None else (self.rotor_rates, self.rotors.inertia)
+
+    def rotor_rates(self, x: Float[Array, "n d"], v: Float[Array, "n d"]) -> Float[Array, " r"]:
+        """How fast the rotors turn (rad/s); linear in `v`."""
+        return jnp.zeros(0, x.dtype) if self.rotors is None else self.rotors.gears @ self.joint_velocities(x, v)
+
     def potential_energy(self, x: Float[Array, "n d"]) -> Float[Array, ""]:
-        """`V(x)` (J)."""
-        return self.potential(x, self.mass_matrix())
+        """`V(x)` (J), with that of springs of joints."""
+        energy = self.potential(x, self.mass_matrix())
+        if not any(type(force).energy is not Force.energy for force in self.forces):
+            return energy
+        q = self.joint_positions(x)
+        return energy + sum((force.energy(q) for force in self.forces), jnp.zeros((), x.dtype))
+
+    def other_forces(
+        self, x: Float[Array, "n d"], v: Float[Array, "n d"], signal: Float[Array, " u"] | None = None
+    ) -> Float[Array, "n d"]:
+        """Forces (N) on the points beside those of the potential: of joints, actuators and bodies.
+
+        `signal`: what actuators are driven with, see `Actuators`; nothing by default.
+        """
+        total = jnp.zeros_like(x)
+        for force in self.forces:
+            if type(force).on_points is not Force.on_points:
+                total = total + force.on_points(x, v)
+        of_joints = [force for force in self.forces if type(force).torque is not Force.torque]
+        if not of_joints:
+            return total
+        motors = self.actuators
+        if signal is None:
+            signal = jnp.zeros(0 if motors is None else motors.count, x.dtype)
+        rates, back = jax.vjp(lambda v: self.joint_velocities(x, v), v)
+        at = Coordinates(self.joint_positions(x), rates)
+        torque = sum((force.torque(at, signal) for force in of_joints), jnp.zeros_like(rates))
+        return total + back(torque)[0]
+
+    def acceleration(
+        self, x: Float[Array, "n d"], v: Float[Array, "n d"], control: Float[Array, " u"] | None = None
+    ) -> Float[Array, "n d"]:
+        """Accelerations (m/s^2) of the points without contact, with `control` of the actuators, by default none."""
+        motors = self.actuators
+        signal = None
+        if motors is not None:
+            control = jnp.zeros(motors.count, x.dtype) if control is None else jnp.asarray(control, x.dtype)
+            signal = signal_of(motors, control, control).start
+        return lagrangian_field(
+            x,
+            v,
+            force=self.other_forces(x, v, signal) - jax.grad(self.potential_energy)(x),
+            inverse_mass=self.inverse_mass_matrix(),
+            constraints=self.constraints,
+            rotors=self.rotor_terms,
+        )[1]
+
+    def dissipation(self, x: Float[Array, "*t n d"], v: Float[Array, "*t n d"]) -> Float[Array, "*t"]:
+        """Power (W) that damping, drag and fluids take from a state, or from states along leading axes."""
+        if x.ndim > 2:
+            return jax.vmap(self.dissipation)(x, v)
+        alone = self._with("forces", tuple(force for force in self.forces if force.dissipates()))
+        return -jnp.sum(alone.other_forces(x, v) * v)
+
+    def joint_accelerations(
+        self, x: Float[Array, "n d"], v: Float[Array, "n d"], acceleration: Float[Array, "n d"]
+    ) -> Float[Array, " q"]:
+        """How fast the rates of the joints' coordinates change (rad/s^2, m/s^2)."""
+        return jax.jvp(self.joint_velocities, (x, v), (v, acceleration))[1]
 
     def energy(self, x: Float[Array, "*t n d"], v: Float[Array, "*t n d"]) -> Float[Array, "*t"]:
         """Total energy (J) of a state, or of states along leading axes."""
         if x.ndim > 2:
             return jax.vmap(self.energy)(x, v)
-        return self.kinetic_energy(v) + self.potential_energy(x)
+        return self.kinetic_energy(v) + self.rotor_energy(x, v) + self.potential_energy(x)
 
     def constraints(self, x: Float[Array, "*t n d"]) -> Float[Array, "*t E"]:
         """`Phi(x)` of all links and rigid bodies, zero where they hold (m^2)."""

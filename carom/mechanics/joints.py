@@ -138,7 +138,7 @@ class Joints(Constraint):
                 parts.append((angles if kind == "hinge" else amounts).pop(0)[None])
         q = self.rest + (jnp.concatenate(parts) if parts else jnp.zeros(0, x.dtype))
         turns = 2 * jnp.pi * jnp.round((q - self.near) / (2 * jnp.pi))
-        return q - jnp.where(np.array(self._is("hinge")), jax.lax.stop_gradient(turns), 0)
+        return q - jnp.where(np.array(self.is_hinge()), jax.lax.stop_gradient(turns), 0)
 
     def rates(self, x: Float[Array, "n d"], v: Float[Array, "n d"]) -> Float[Array, " q"]:
         """How fast coordinates change (rad/s, m/s); of balls and what is free, the angular velocity in the frame that
@@ -202,9 +202,9 @@ class Joints(Constraint):
 
     # --- parts ------------------------------------------------------------------------------------------------
 
-    def _is(self, kind: JointKind) -> list[bool]:
-        """Of each coordinate, whether it is of such a joint."""
-        return [k == kind for k, size in zip(self.kinds, self.sizes, strict=True) for _ in range(size)]
+    def is_hinge(self) -> list[bool]:
+        """Of each coordinate, whether it is the angle of a hinge."""
+        return [kind == "hinge" for kind, size in zip(self.kinds, self.sizes, strict=True) for _ in range(size)]
 
     def _of(self, kind: JointKind) -> list[int]:
         return [k for k, this in enumerate(self.kinds) if this == kind]

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from carom.checks import positive, require, require_values
 from carom.contact.energy import dissipative
 from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
-from carom.mechanics.dynamics import FIELDS, Formulation, SaddlePoint
+from carom.mechanics.dynamics import FIELDS, Formulation, saddle_point
+from carom.mechanics.forces import Signal
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
 from carom.system import System
@@ -75,28 +76,40 @@ class StepResult(eqx.Module):
 
 
 def smooth_flow(
-    system: System, stepper: Stepper, inverse_mass: Float[Array, "n n"], force=None
+    system: System, stepper: Stepper, inverse_mass: Float[Array, "n n"], force=None, signal: Signal | None = None
 ) -> tuple[Callable, Callable]:
     """The motion between impacts, as two functions of a state `(x, v)`: its rate, and the state after a time (s).
 
-    Both take the forces of contacts that last, if any: (C, d) in N, in the frame of each candidate (normal first).
+    Both take the forces of contacts that last, if any: (C, d) in N, in the frame of each candidate (normal first); and
+    the time (s) since the step began, which only what `signal` drives hangs on.
     """
     field = FIELDS[stepper.formulation]
 
-    def rate(state, pressing=None):
+    def rate(state, pressing=None, since=0.0):
         x, v = state
         total = -jax.grad(system.potential_energy)(x)
+        if system.forces:
+            total = total + system.other_forces(x, v, None if signal is None else signal.at(since))
         if force is not None:
             total = total + force
         if pressing is not None:
             total = total + contact_force(system, x, pressing)
-        return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints)
+        terms = {} if system.rotors is None else {"rotors": system.rotor_terms}
+        return field(x, v, force=total, inverse_mass=inverse_mass, constraints=system.constraints, **terms)
 
     # Each is traced once: a step calls them a dozen times, within loops that are transformed several times.
     once = jax.jit(rate)
+    moves = signal is not None and system.actuators is not None and set(system.actuators.dynamics) != {"none"}
 
-    def after(state, time, pressing=None):
-        x, v = flow(stepper.solver, lambda state: once(state, pressing), state, time)
+    def with_clock(state, pressing):
+        return (*once(state[:2], pressing, state[2]), jnp.ones_like(state[2]))
+
+    def after(state, time, pressing=None, since=0.0):
+        if moves:
+            begin = (*state, jnp.asarray(since, state[0].dtype))
+            x, v, _ = flow(stepper.solver, lambda state: with_clock(state, pressing), begin, time)
+        else:
+            x, v = flow(stepper.solver, lambda state: once(state, pressing), state, time)
         return project_state(system.constraints, x, v, inverse_mass) if stepper.project else (x, v)
 
     return once, jax.jit(after)
@@ -126,18 +139,18 @@ def closed_contacts(
     k, d = active.jacobian.shape[:2]
     rows = active.jacobian.reshape(k * d, system.n_points, d)
     response = jnp.einsum("ij,rjd->rid", inverse_mass, rows)  # M^-1 J_C^T
-    saddle = SaddlePoint(jax.jacrev(system.constraints)(x), inverse_mass) if system.links else None
+    held = system.links or system.rotors is not None
+    saddle = saddle_point(system.constraints, x, inverse_mass, system.rotor_terms) if held else None
     if saddle is None:
         delassus = jnp.einsum("rid,sid->rs", rows, response)
     else:
         free = jnp.einsum("rid,rid->r", rows, response)
-        # Twice: the rounding of the first, which a large impulse shows, is an error that the second takes away.
-        response = saddle.project(saddle.project(response))
-        rows, response, delassus = _held(rows, response, free, d, system.mass_matrix())
+        response = saddle.project_exactly(response)  # a large impulse shows its rounding
+        rows, response, delassus = _held(rows, response, free, d, system, x)
     delassus = (delassus + delassus.T) / 2
     velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
     friction = system.friction[active.property_index]
-    if saddle is not None and stepper.consistent and not stepper.project:
+    if saddle is not None and system.rotors is None and stepper.consistent and not stepper.project:
         drift = jnp.einsum("rid,id->r", rows, v - saddle.project(v[None])[0]).reshape(k, d)
         velocity = consistent_velocity(velocity, drift, delassus, friction)
     v_star = jnp.zeros_like(velocity)
@@ -187,7 +200,8 @@ def _held(
     response: Float[Array, "r n d"],
     free: Float[Array, " r"],
     d: int,
-    mass: Float[Array, "n n"],
+    system: System,
+    x: Float[Array, "n d"],
 ) -> tuple[Float[Array, "r n d"], Float[Array, "r n d"], Float[Array, "r r"]]:
     """Rows and responses `R = M^^-1 J_C^T` of contacts on bodies that joints hold, and their Delassus matrix.
 
@@ -197,7 +211,10 @@ def _held(
     A contact whose normal the joints hold for themselves, as below a pendulum that hangs straight, can do nothing: of
     its mobility there is rounding, the share eps of `free`, and an impulse over that would be any. It becomes padding.
     """
-    delassus = jnp.einsum("rid,sid->rs", response, jnp.einsum("ij,sjd->sid", mass, response))
+    delassus = jnp.einsum("rid,sid->rs", response, jnp.einsum("ij,sjd->sid", system.mass_matrix(), response))
+    if system.rotors is not None:
+        turning = jax.vmap(lambda v: system.rotor_rates(x, v))(response)
+        delassus = delassus + (turning * system.rotors.inertia) @ turning.T
     moves = jnp.diagonal(delassus)[::d] > jnp.finfo(free.dtype).eps * free[::d]
     moves = jnp.repeat(moves, d)
     both = jnp.asarray(moves[:, None] & moves)

@@ -1,5 +1,7 @@
 """One time step, and many: `step`, `simulate` and the `Trajectory` they give."""
 
+from collections.abc import Mapping
+
 import diffrax
 import equinox as eqx
 import jax
@@ -10,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from carom.checks import is_known, positive, require, require_values
 from carom.contact.impulses import ContactModel
 from carom.mechanics.dynamics import FIELDS, Formulation
+from carom.mechanics.forces import Signal, signal_of
 from carom.simulation.impact import (
     COMPENSATION_STEPS,
     IMPACT_RULES,
@@ -45,13 +48,20 @@ class Trajectory(eqx.Module):
     residual: Float[Array, "*b time"]
 
 
-def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper: Stepper, force=None) -> StepResult:
+def step(
+    system: System,
+    x: Float[Array, "n d"],
+    v: Float[Array, "n d"],
+    stepper: Stepper,
+    force: Float[Array, "n d"] | None = None,
+    signal: Signal | None = None,
+) -> StepResult:
     """One step of `stepper.dt`: contact that lasts acts over it, and impacts happen (see `carom.simulation.segments`).
 
     By the paper's rule, and where a contact model has no impulses (a network), the whole step is integrated, and then
     the contacts act that are closed at its end.
 
-    A system with a `step_model` is moved by that alone.
+    `signal`: what its actuators are driven with. A system with a `step_model` is moved by that alone.
     """
     if system.step_model is not None:
         require(force is None, "force must be None for a system with a step_model: it has no forces.")
@@ -59,7 +69,7 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
         closed = jnp.any(system.gaps(x) < 0)
         return StepResult(x, v, closed, overflow=jnp.asarray(0), residual=jnp.zeros((), x.dtype))
     inverse_mass = system.inverse_mass_matrix()
-    rate, after = smooth_flow(system, stepper, inverse_mass, force)
+    rate, after = smooth_flow(system, stepper, inverse_mass, force, signal)
     if not stepper.contact or not system.contacts:
         x, v = after((x, v), stepper.dt)
         return StepResult(x, v, jnp.asarray(False), jnp.asarray(0), jnp.zeros((), x.dtype))
@@ -69,14 +79,19 @@ def step(system: System, x: Float[Array, "n d"], v: Float[Array, "n d"], stepper
     return step_in_segments(system, x, v, inverse_mass, stepper, (rate, after))
 
 
-def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) -> Trajectory:
+def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None, control=None) -> Trajectory:
     """`steps` steps from one state (n, d): the pure function under `simulate`."""
+    motors = system.actuators if control is not None else None
 
-    def body(state, force):
-        result = step(system, state[0], state[1], stepper, force)
-        return (result.x, result.v), result
+    def body(state, given):
+        x, v, activation = state
+        force, control = given
+        signal = None if motors is None else signal_of(motors, control, activation)
+        result = step(system, x, v, stepper, force, signal)
+        return (result.x, result.v, activation if signal is None else signal.at(stepper.dt)), result
 
-    _, out = jax.lax.scan(body, (x0, v0), force, length=steps)
+    begin = jnp.zeros(0 if motors is None else motors.count, x0.dtype)
+    _, out = jax.lax.scan(body, (x0, v0, begin), (force, control), length=steps)
 
     def start(first, rest):
         return jnp.concatenate([jnp.asarray(first, rest.dtype)[None], rest])
@@ -95,12 +110,14 @@ def rollout(system: System, x0, v0, stepper: Stepper, steps: int, force=None) ->
 
 
 @eqx.filter_jit
-def _simulate(system, x0, v0, stepper, steps, force):
+def _simulate(system, x0, v0, stepper, steps, force, control):
+    def one(x, v, force, control):
+        return rollout(system, x, v, stepper, steps, force, control)
+
     if x0.ndim == 2:
-        return rollout(system, x0, v0, stepper, steps, force)
-    out = jax.vmap(lambda x, v, f: rollout(system, x, v, stepper, steps, f), (0, 0, None if force is None else 0))(
-        x0, v0, force
-    )
+        return one(x0, v0, force, control)
+    axes = (0, 0, *(None if given is None else 0 for given in (force, control)))
+    out = jax.vmap(one, axes)(x0, v0, force, control)
     return eqx.tree_at(lambda t: t.time, out, out.time[0])
 
 
@@ -123,6 +140,7 @@ def simulate(
     max_events: int = MAX_EVENTS,
     project: bool = True,
     force: Float[Array, "*b steps n d"] | None = None,
+    control: Float[Array, "*b steps u"] | Mapping[str, Float[Array, "*b steps"]] | None = None,
     formulation: Formulation = "lagrangian",
     solver: diffrax.AbstractSolver | None = None,
     compensation_steps: float | Float[Array, ""] | None = COMPENSATION_STEPS,
@@ -143,6 +161,8 @@ def simulate(
     - `max_events`: most times at which a step may be cut; more are an error.
     - `project`: bring each step's end back onto the constraints.
     - `force`: (steps, n, d) or (N, steps, n, d) in N, held over each step, added to the generalised force.
+    - `control`: (steps, u) or (N, steps, u), of the system's actuators, or by their names (steps,) or (N, steps) each
+      (those not named get zero); held over each step. None: nothing drives them.
     - `formulation`: `"lagrangian"` or `"hamiltonian"`; the same motion.
     - `solver`: an explicit Runge-Kutta method of diffrax, such as `Tsit5()`; by default `RK4`.
     - `compensation_steps`: time steps over which penetration is undone where nothing pushes it back, or `None` to
@@ -184,6 +204,7 @@ def simulate(
         if force.shape == wanted[-3:]:
             force = jnp.broadcast_to(force, wanted)
         require(force.shape == wanted, f"force must have the shape {wanted}; it was {force.shape}.")
+    control = controls(system, control, x0.shape[:-2], int(steps), x0.dtype)
     stepper = Stepper(
         dt=jnp.asarray(dt, x0.dtype),
         formulation=formulation,
@@ -196,10 +217,42 @@ def simulate(
     )
     if x0.shape[0] == 0 and x0.ndim == 3:
         return _nothing(stepper, x0, int(steps))
-    out = _simulate(system, x0, v0, stepper, int(steps), force)
+    out = _simulate(system, x0, v0, stepper, int(steps), force, control)
     if throw:
         check_trajectory(system, out)
     return out
+
+
+def controls(system: System, control, batch: tuple[int, ...], steps: int, dtype) -> Float[Array, "*b steps u"] | None:
+    """`control` as one array, with the axes of the batch; None for a system without actuators.
+
+    **Raises:** `CaromError` for names and shapes that do not fit, and numbers that are not finite.
+    """
+    motors = system.actuators
+    if motors is None:
+        require(control is None, "control must be None for a system without actuators.")
+        return None
+    names = ", ".join(motors.names)
+    if control is None:
+        return jnp.zeros((*batch, steps, motors.count), dtype)
+    if isinstance(control, Mapping):
+        unknown = [name for name in control if name not in motors.names]
+        require(not unknown, f"control names {unknown[:1]}, which is no actuator of the system: it has {names}.")
+        columns = [jnp.asarray(control.get(name, jnp.zeros(steps)), dtype) for name in motors.names]
+        for name, column in zip(motors.names, columns, strict=True):
+            require(
+                column.shape in ((steps,), (*batch, steps)),
+                f"control of {name!r} must have the shape {(*batch, steps)} or {(steps,)}; it was {column.shape}.",
+            )
+        control = jnp.stack([jnp.broadcast_to(column, (*batch, steps)) for column in columns], axis=-1)
+    control, wanted = jnp.asarray(control, dtype), (*batch, steps, motors.count)
+    require(
+        control.shape in (wanted, wanted[-2:]),
+        f"control must have the shape {wanted} (or {wanted[-2:]}), an actuator a column ({names}); it was "
+        f"{control.shape}.",
+    )
+    require_values("control", control, np.isfinite, "finite numbers")
+    return jnp.broadcast_to(control, wanted)
 
 
 def check_trajectory(system: System, trajectory: Trajectory) -> None:

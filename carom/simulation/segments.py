@@ -200,7 +200,7 @@ class Segments:
 
     def touching(self, state: _Segment, left: Float[Array, ""]) -> tuple[_Segment, Float[Array, "C d"]]:
         """Which contacts are closed and stay so, and how fast all contacts' velocities change without them (m/s^2)."""
-        motion = self.rate((state.x, state.v))
+        motion = self.rate((state.x, state.v), None, self.stepper.dt - left)
 
         def seen(x, v):
             candidates = self.system.candidates(x)
@@ -319,7 +319,8 @@ class Segments:
         left = now.left
         pressing = impulse / jnp.where(left > 0, left, 1)
         begin = (state.x, state.v)
-        end = self.after(begin, left, pressing)
+        since = self.stepper.dt - left
+        end = self.after(begin, left, pressing, since)
         if self.stepper.impact == "step":
             time, again, unsure = left, jnp.asarray(False), jnp.asarray(False)
             closed = jax.lax.stop_gradient(self.system.gaps(end[0])) < 0
@@ -328,10 +329,10 @@ class Segments:
             event = next_event(self.still, *still, now.acted | state.lasts)
 
             def rate(state):
-                return self.rate(state, pressing)
+                return self.rate(state, pressing, since)
 
             def after(state, time):
-                return self.after(state, time, pressing)
+                return self.after(state, time, pressing, since)
 
             met, time, closed, again = to_event(begin, left, event, self.system, (rate, after))
             # The last segment goes on to the end of the step, where slow contacts are met. To miss a fast one is wrong.
