@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from carom.checks import as_floats, at_once_if_known, is_share, not_negative, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, traced_candidates
 from carom.contact.impulses import ContactModel, contact_model_of
+from carom.contact.joint_limits import DryFriction
 from carom.mechanics.bodies import (
     Body,
     BodyTable,
@@ -227,6 +228,14 @@ class System(eqx.Module):
     def radii(self) -> Float[Array, " bodies"]:
         """Radii of the bodies (m)."""
         return jnp.stack([body.radius for body in self.bodies])
+
+    def dry_friction(self) -> tuple[np.ndarray, Float[Array, " C"]]:
+        """Which contacts are dry friction of joints, and what they can hold (N m, N)."""
+        parts = [(isinstance(contact, DryFriction), contact) for contact in self.contacts]
+        dry = np.array([is_dry for is_dry, contact in parts for _ in contact.property_index], bool)
+        none = [jnp.zeros(0, self.friction.dtype)]
+        loss = [getattr(c, "loss", jnp.zeros(len(c.property_index), self.friction.dtype)) for _, c in parts]
+        return dry, jnp.concatenate(none + loss)
 
     def _property_index(self) -> np.ndarray:
         return np.array([p for contact in self.contacts for p in contact.property_index], dtype=int)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from carom.checks import (
     as_floats,
@@ -134,6 +134,7 @@ class BallBall(Contact):
     - `centers` (c, 2, d), of the balls, from the centres of mass along the bodies' axes, or in space (m).
     - `radii` (c, 2) (m), positive.
     - `property`, index into the system's `friction` and `restitution`: one for all, or one for each pair.
+    - `margin` (m), one for all or (c,): how far apart they are kept, beside their radii.
 
     **Raises:** `CaromError` for shapes that do not fit, a body with itself, or radii that are not positive.
     """
@@ -141,9 +142,17 @@ class BallBall(Contact):
     pairs: tuple[tuple[int, int | None], ...] = eqx.field(static=True)
     centers: Float[Array, "c 2 d"]
     radii: Float[Array, "c 2"]
+    margin: Float[Array, "..."]
     property_index: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, pairs: Iterable[tuple[int, int | None]], centers, radii, property: int | Sequence[int] = 0):
+    def __init__(
+        self,
+        pairs: Iterable[tuple[int, int | None]],
+        centers,
+        radii,
+        property: int | Sequence[int] = 0,
+        margin: ArrayLike = 0.0,
+    ):
         self.pairs = tuple(
             (whole("BallBall pairs", a), None if b is None else whole("BallBall pairs", b)) for a, b in pairs
         )
@@ -160,6 +169,12 @@ class BallBall(Contact):
             f"BallBall radii must be {count} pairs; their shape was {self.radii.shape}.",
         )
         require_values("radii", radii, positive, "positive lengths in m")
+        self.margin = as_floats(margin)
+        require(
+            self.margin.shape in ((), (count,)),
+            f"BallBall margin must be one length or {count}; its shape was {self.margin.shape}.",
+        )
+        require_values("margin", margin, not_negative, "zero or positive lengths in m")
         require_values("centers", centers, np.isfinite, "finite coordinates in m")
         self.property_index = property_indices("BallBall", property, count)
 
@@ -180,7 +195,9 @@ class BallBall(Contact):
         weights_b = inner_b + table.weights(x, second, self.radii[:, 1:] * normal)
         weights = jnp.concatenate([weights_a, jnp.where(fixed[:, None], 0, -weights_b)], axis=1)
         return Candidates(
-            touch.gap, np.concatenate(stencils, axis=1), weights[:, None, :, None] * touch.frame[:, :, None, :]
+            touch.gap - self.margin,
+            np.concatenate(stencils, axis=1),
+            weights[:, None, :, None] * touch.frame[:, :, None, :],
         )
 
     def reach(self, radii):

@@ -45,20 +45,24 @@ class Force(eqx.Module):
 
 
 class JointSpring(Force):
-    """Springs of joints: energy `sum stiffness (q - rest)^2 / 2`.
+    """Springs of joints: torques `-(stiffness s + quadratic s^2 + cubic s^3)`, `s = q - rest`.
 
     **Arguments:** `stiffness` (q,), of each coordinate of the system's joints (N m/rad, N/m), or one for all; `rest`
-    (q,), where they are slack (rad, m), or one for all; `deadband`, half of the width in which there is no force.
-    `gears` (s, q), if given: the springs are those of the lengths `gears q`, of tendons say, with one number for each.
+    (q,), where they are slack (rad, m), or one for all; `deadband`, half of the width in which there is no force;
+    `quadratic` and `cubic`, zero by default. `gears` (s, q), if given: the springs are those of the lengths `gears q`,
+    of tendons say, with one number for each.
     """
 
     stiffness: Float[Array, "..."]
     rest: Float[Array, "..."]
     deadband: Float[Array, "..."]
+    quadratic: Float[Array, "..."]
+    cubic: Float[Array, "..."]
     gears: Float[Array, "s q"] | None
 
-    def __init__(self, stiffness, rest=0.0, deadband=0.0, gears=None):
+    def __init__(self, stiffness, rest=0.0, deadband=0.0, quadratic=0.0, cubic=0.0, gears=None):
         self.stiffness, self.rest, self.deadband = as_floats(stiffness), as_floats(rest), as_floats(deadband)
+        self.quadratic, self.cubic = as_floats(quadratic), as_floats(cubic)
         self.gears = None if gears is None else as_floats(gears)
         require_values("JointSpring stiffness", stiffness, not_negative, "zero or positive numbers of N m/rad or N/m")
         require_values("JointSpring deadband", deadband, not_negative, "zero or positive numbers of rad or m")
@@ -67,29 +71,30 @@ class JointSpring(Force):
         length = q if self.gears is None else self.gears @ q
         off = length - self.rest
         off = jnp.sign(off) * jnp.maximum(jnp.abs(off) - self.deadband, 0)
-        return jnp.sum(self.stiffness * off**2) / 2
+        return jnp.sum(self.stiffness * off**2 / 2 + self.quadratic * off**3 / 3 + self.cubic * off**4 / 4)
 
 
 class JointDamping(Force):
-    """Viscous damping of joints: torques `-(viscous + quadratic |rate|) rate`.
+    """Damping of joints: torques `-(viscous + quadratic |rate| + cubic rate^2) rate`.
 
     **Arguments:** `viscous` (q,), of each coordinate of the system's joints (N m s/rad, N s/m), or one for all;
-    `quadratic`, alike (N m s^2/rad^2, N s^2/m^2). `gears` (s, q), if given: of the lengths `gears q`, of tendons say.
+    `quadratic` and `cubic` alike, zero by default. `gears` (s, q), if given: of the lengths `gears q`, of tendons say.
     """
 
     viscous: Float[Array, "..."]
     quadratic: Float[Array, "..."]
+    cubic: Float[Array, "..."]
     gears: Float[Array, "s q"] | None
 
-    def __init__(self, viscous, quadratic=0.0, gears=None):
-        self.viscous, self.quadratic = as_floats(viscous), as_floats(quadratic)
+    def __init__(self, viscous, quadratic=0.0, cubic=0.0, gears=None):
+        self.viscous, self.quadratic, self.cubic = as_floats(viscous), as_floats(quadratic), as_floats(cubic)
         self.gears = None if gears is None else as_floats(gears)
-        for name, value in (("viscous", viscous), ("quadratic", quadratic)):
+        for name, value in (("viscous", viscous), ("quadratic", quadratic), ("cubic", cubic)):
             require_values(f"JointDamping {name}", value, not_negative, "zero or positive numbers")
 
     def torque(self, at, signal):
         rate = at.rate if self.gears is None else self.gears @ at.rate
-        torque = -(self.viscous + self.quadratic * jnp.abs(rate)) * rate
+        torque = -(self.viscous + self.quadratic * jnp.abs(rate) + self.cubic * rate**2) * rate
         return torque if self.gears is None else self.gears.T @ torque
 
     def dissipates(self):
@@ -143,7 +148,9 @@ class Actuators(Force):
         torque_range=None,
     ):
         self.gears = as_floats(gears)
-        require(self.gears.ndim == 2, f"Actuators gears must be (actuators, coordinates); they were {self.gears.shape}.")
+        require(
+            self.gears.ndim == 2, f"Actuators gears must be (actuators, coordinates); they were {self.gears.shape}."
+        )
         u = self.gears.shape[0]
         gain = np.asarray(gain, float)
         if gain.ndim < 2:

@@ -309,6 +309,52 @@ class Joints(Constraint):
         return [amounts[k] for k in range(len(ways))], free @ left
 
 
+class Coupling(Constraint):
+    """Coordinates of joints that hang on each other: a gear, a belt, a mimic joint.
+
+    `first (q - zeros_0) = c_0 + c_1 s + ... + c_4 s^4`, `s = second q - zeros_1`, in rad or m.
+
+    **Arguments:** `joints`, as they stand in the system's constraints; `first`, `second` (q,) over their coordinates,
+    one after the other; `coefficients` (c,); `zeros` (2,).
+    """
+
+    joints: tuple[Joints, ...]
+    first: Float[Array, " q"]
+    second: Float[Array, " q"]
+    coefficients: Float[Array, " c"]
+    zeros: Float[Array, " 2"]
+
+    def __init__(self, joints: Sequence[Joints], first, second, coefficients, zeros=(0.0, 0.0)):
+        self.joints = tuple(joints)
+        self.first, self.second, self.coefficients = as_floats(first), as_floats(second), as_floats(coefficients)
+        self.zeros, count = as_floats(zeros), sum(joint.count for joint in self.joints)
+        for name, value in (("first", self.first), ("second", self.second)):
+            require(
+                value.shape == (count,),
+                f"Coupling {name} must be {count} numbers, one a coordinate; its shape was {value.shape}.",
+            )
+
+    @classmethod
+    def of(cls, joints: Sequence[Joints], first, second, coefficients, zeros=(0.0, 0.0)) -> "Coupling":
+        """The same with all joints of a system, of which those that it does not hang on are left out."""
+        ends = np.cumsum([joint.count for joint in joints])
+        spans = [slice(end - joint.count, end) for joint, end in zip(joints, ends, strict=True)]
+        used = [k for k, at in enumerate(spans) if np.any(np.asarray(first)[at]) or np.any(np.asarray(second)[at])]
+        rows = [np.concatenate([np.asarray(row)[spans[k]] for k in used]) for row in (first, second)]
+        return cls([joints[k] for k in used], *rows, coefficients, zeros)
+
+    def __call__(self, x):
+        q = jnp.concatenate([joint.coordinates(x) for joint in self.joints])
+        s = self.second @ q - self.zeros[1]
+        return (self.first @ q - self.zeros[0] - jnp.polyval(self.coefficients[::-1], s))[None]
+
+    def points(self):
+        return tuple(dict.fromkeys(p for joint in self.joints for p in joint.points()))
+
+    def size(self, length):
+        return jnp.ones_like(length)
+
+
 def _check_kinds(kinds: Sequence[str], d: int, j: int | None) -> None:
     wrong = [kind for kind in kinds if kind not in JOINT_KINDS]
     require(not wrong, f"Joints kinds must be of {', '.join(JOINT_KINDS)}; they were {', '.join(map(str, kinds))}.")

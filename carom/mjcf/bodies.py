@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from carom.checks import require
 from carom.mechanics.bodies import RigidBody, embed_pose, embed_velocity
-from carom.mechanics.constraints import Constraint, Joint, Pivot, Track, place_weights
 from carom.mechanics.joints import JointKind, Joints
 
 KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # mjtJoint
 MEET = 1e-6
 """Axes that are nearer to each other than this (m) go through one point."""
 SPHERE, BOX = 2, 6  # mjtGeom
+WRAP_JOINT = 1  # mjtWrap
 POINTS = 4
 """Points of a rigid body in 3D."""
 NEAR = 1e-9
@@ -67,6 +67,21 @@ def name_of(model: Any, kind: str, index: int) -> str:
     owner = {"geom": "geom_bodyid", "joint": "jnt_bodyid"}.get(kind)
     where = "" if owner is None else f" of body {name_of(model, 'body', int(getattr(model, owner)[index]))}"
     return f"number {index}{where}"
+
+
+def is_off(mujoco: Any, model: Any, flag: str) -> bool:
+    """Whether MuJoCo itself is told to leave something out: `"LIMIT"`, `"SPRING"` and so on."""
+    return bool(model.opt.disableflags & int(mujoco.mjtDisableBit.__members__[f"mjDSBL_{flag}"]))
+
+
+def tendon_gears(model: Any) -> Float[np.ndarray, "t nv"]:
+    """How far each tendon moves with each coordinate; zeros for tendons that go through space."""
+    gears = np.zeros((model.ntendon, model.nv))
+    for k in range(model.ntendon):
+        for w in range(int(model.tendon_adr[k]), int(model.tendon_adr[k] + model.tendon_num[k])):
+            if model.wrap_type[w] == WRAP_JOINT:
+                gears[k, int(model.jnt_dofadr[int(model.wrap_objid[w])])] += model.wrap_prm[w]
+    return gears
 
 
 def placed(mujoco: Any, model: Any, qpos, qvel=0.0) -> Any:
@@ -187,11 +202,12 @@ def joints_of(model: Any, data: Any, groups: dict[int, Group]) -> list[Joints]:
 def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence[int]) -> Joints:
     assert group.first is not None
     kinds = [KINDS[int(model.jnt_type[joint])] for joint in joints]
-    hinges, slides, balls = (kinds.count(kind) for kind in ("hinge", "slide", "ball"))
+    hinges, balls = (kinds.count(kind) for kind in ("hinge", "ball"))
     for kind, most in (("hinge", 3), ("slide", 3), ("ball", 1)):
         rows = np.array([data.xaxis[j] for j, k in zip(joints, kinds, strict=True) if k == kind])
         require(
-            len(rows) <= most and (kind == "ball" or len(rows) < 2 or np.linalg.matrix_rank(rows, tol=1e-6) == len(rows)),
+            len(rows) <= most
+            and (kind == "ball" or len(rows) < 2 or np.linalg.matrix_rank(rows, tol=1e-6) == len(rows)),
             f"body '{group.name}' has {len(rows)} {kind}s whose axes are not independent. Remove those that add no "
             "freedom.",
         )
@@ -202,9 +218,7 @@ def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence
     turning = [data.xanchor[j] for j, kind in zip(joints, kinds, strict=True) if kind != "slide"]
     point = turning[0] if turning else group.place
     meet = bool(np.ptp(turning, axis=0).max() < MEET) if turning else True
-    anchors = [
-        point if kind == "slide" or meet else data.xanchor[j] for j, kind in zip(joints, kinds, strict=True)
-    ]
+    anchors = [point if kind == "slide" or meet else data.xanchor[j] for j, kind in zip(joints, kinds, strict=True)]
     rest, near = [], []
     for joint, kind in zip(joints, kinds, strict=True):
         at = int(model.jnt_qposadr[joint])
@@ -227,101 +241,3 @@ def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence
         data.xmat[group.root].reshape(3, 3).T @ group.axes,
         [name_of(model, "joint", joint).strip("'") for joint in joints],
     )
-
-
-# --- loops ----------------------------------------------------------------------------------------
-
-
-class Loop(NamedTuple):
-    """A `connect` equality: MuJoCo bodies, and where it holds each in its own frame (m)."""
-
-    name: str
-    bodies: tuple[int, int]
-    places: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
-
-
-def loops_of(mujoco: Any, model: Any) -> list[Loop]:
-    """The `connect` equalities that act at the start."""
-    if model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
-        return []
-    found = []
-    for k in range(model.neq):
-        if model.eq_type[k] != mujoco.mjtEq.mjEQ_CONNECT or not model.eq_active0[k]:
-            continue
-        ends = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
-        if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_SITE:
-            first, second = (np.array(model.site_pos[s]) for s in ends)
-            ends = int(model.site_bodyid[ends[0]]), int(model.site_bodyid[ends[1]])
-        else:
-            first, second = np.array(model.eq_data[k, :3]), np.array(model.eq_data[k, 3:6])
-        if model.body_weldid[ends[0]] == 0:  # the world, if any, comes second
-            ends, first, second = (ends[1], ends[0]), second, first
-        found.append(Loop(name_of(model, "equality", k), ends, (first, second)))
-    return found
-
-
-def connects_of(
-    mujoco: Any, model: Any, reference: Any, groups: dict[int, Group], loops: list[Loop], qpos
-) -> list[Constraint]:
-    """`connect` equalities, without the equations that follow from the others.
-
-    In a plane linkage of hinges, a loop closes in the plane alone: the third equation of a pivot would follow. Which
-    do is seen in MuJoCo's joint coordinates, at the start and near it.
-
-    **Raises:** `CaromError` where the ends are apart, nothing is left, or the start is a position of its own kind.
-    """
-    moved = np.array(qpos)
-    mujoco.mj_integratePos(model, moved, np.random.default_rng(0).uniform(0.01, 0.02, model.nv), 1.0)
-    start, near = placed(mujoco, model, qpos), placed(mujoco, model, moved)
-    rows, rows_near, found = np.zeros((0, model.nv)), np.zeros((0, model.nv)), []
-    for loop in loops:
-        welds = [groups[int(model.body_weldid[b])] for b in loop.bodies]
-        places = [
-            reference.xpos[b] + reference.xmat[b].reshape(3, 3) @ c
-            for b, c in zip(loop.bodies, loop.places, strict=True)
-        ]
-        mine, normals, gap = _relative(mujoco, model, start, loop, rows)
-        require(
-            gap < 1e-5,
-            f"connect {loop.name} is open by {gap:.3g} m at the start: give a keyframe at which its ends meet.",
-        )
-        mine_near, normals_near, _ = _relative(mujoco, model, near, loop, rows_near)
-        left_out = _complement(normals)
-        require(
-            len(normals) > 0 and bool(np.abs(normals_near @ left_out.T).max(initial=0) < 1e-6),
-            f"connect {loop.name} holds what is held already, or the start is a singular position of its loop (a "
-            "linkage that is stretched out, say). Remove it, or start elsewhere with a keyframe.",
-        )
-        rows, rows_near = np.concatenate([rows, mine]), np.concatenate([rows_near, mine_near])
-        found.append(_closed(welds, places, normals, loop, reference))
-    return found
-
-
-def _relative(mujoco: Any, model: Any, data: Any, loop: Loop, rows):
-    """What a `connect` adds to the equations `rows` (k, nv): its own, their directions in the frame of the second body.
-
-    Also how far its ends are apart (m).
-    """
-    ends, jacobians = [], []
-    for body, place in zip(loop.bodies, loop.places, strict=True):
-        ends.append(data.xpos[body] + data.xmat[body].reshape(3, 3) @ place)
-        jacobians.append(np.zeros((3, model.nv)))
-        mujoco.mj_jac(model, data, jacobians[-1], None, ends[-1], body)
-    frame = data.xmat[loop.bodies[1]].reshape(3, 3)
-    mine = frame.T @ (jacobians[0] - jacobians[1])
-    left = mine - mine @ np.linalg.pinv(rows, rcond=1e-7) @ rows
-    directions, sizes, _ = np.linalg.svd(left)
-    kept = directions.T[: len(sizes)][sizes > 1e-7 * max(float(np.abs(mine).max()), 1e-12)]
-    return kept @ mine, kept, float(np.linalg.norm(ends[0] - ends[1]))
-
-
-def _closed(welds: list[Group], places, normals, loop: Loop, reference: Any) -> Constraint:
-    body, other = welds
-    assert body.first is not None
-    weights = place_weights(body.local(places[0]))
-    if len(normals) == 3:
-        if other.first is None:
-            return Joint(body.first, weights, places[1])
-        return Pivot(body.first, weights, other.first, place_weights(other.local(places[1])))
-    turn = reference.xmat[loop.bodies[1]].reshape(3, 3)
-    return Track(body.first, weights, other.directions(normals @ turn.T), other.local(places[1]), other.first)

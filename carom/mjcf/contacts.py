@@ -52,7 +52,7 @@ def touching_pairs(mujoco: Any, model: Any) -> list[Touching]:
             key,
             np.array(model.pair_friction[k, :2]),
             int(model.pair_dim[k]),
-            float(abs(model.pair_margin[k]) + abs(model.pair_gap[k])),
+            float(model.pair_margin[k]),
             float(model.pair_adhesion[k]),
             k,
         )
@@ -89,7 +89,7 @@ def _combined(model: Any, geoms: tuple[int, int]) -> Touching:
         geoms,
         np.array([slide, slide]),
         int(np.max(model.geom_condim[chosen])),
-        float(np.abs(model.geom_margin[pair]).sum() + np.abs(model.geom_gap[pair]).sum()),
+        float(np.max(model.geom_margin[pair])),
         float(np.abs(model.geom_adhesion[pair]).sum()),
     )
 
@@ -117,7 +117,7 @@ def contact_refusals(model: Any, touching: list[Touching], *, urdf: bool = False
         ),
         some("rolling", "torsional and rolling friction: set condim to 3", lambda t: t.condim > 3),
         some("anisotropic", "give both directions one friction", lambda t: t.friction[0] != t.friction[1]),
-        some("margin", "set margin and gap to 0", lambda t: t.margin != 0),
+        some("margin", "below 0: set it to 0", lambda t: t.margin < 0),
         some("adhesion", "set it to 0", lambda t: t.adhesion != 0),
         some("surfacevel", "set it to 0", lambda t: bool(model.geom_surfacevel[list(t.geoms)].any())),
     ]
@@ -145,8 +145,10 @@ def contacts_of(model: Any, data: Any, groups: dict[int, Group], touching: list[
     """Contacts for the pairs that carom knows; `data` is at the reference position."""
     known = [t for t in touching if _known(model, t)]
     found: list[Contact] = []
-    for floor in dict.fromkeys(t.geoms[0] for t in known if model.geom_type[t.geoms[0]] == PLANE):
-        found += _on_plane(model, data, groups, floor, [(k, t) for k, t in enumerate(known) if t.geoms[0] == floor])
+    planes = [(t.geoms[0], t.margin) for t in known if model.geom_type[t.geoms[0]] == PLANE]
+    for floor, margin in dict.fromkeys(planes):
+        on = [(k, t) for k, t in enumerate(known) if t.geoms[0] == floor and t.margin == margin]
+        found += _on_plane(model, data, groups, floor, margin, on)
     balls = [(k, t) for k, t in enumerate(known) if model.geom_type[t.geoms[0]] == SPHERE]
     if balls:
         found.append(_between(model, data, groups, balls))
@@ -158,9 +160,10 @@ def _group_of(model: Any, groups: dict[int, Group], geom: int) -> Group:
     return groups[int(model.body_weldid[model.geom_bodyid[geom]])]
 
 
-def _on_plane(model: Any, data: Any, groups: dict[int, Group], floor: int, on: list) -> list[Contact]:
-    """Boxes along their bodies' axes by their corners; all else as balls."""
-    point, normal = data.geom_xpos[floor].copy(), data.geom_xmat[floor].reshape(3, 3)[:, 2].copy()
+def _on_plane(model: Any, data: Any, groups: dict[int, Group], floor: int, margin: float, on: list) -> list[Contact]:
+    """Boxes along their bodies' axes by their corners; all else as balls. `margin` (m) keeps them off the plane."""
+    normal = data.geom_xmat[floor].reshape(3, 3)[:, 2].copy()
+    point = data.geom_xpos[floor] + margin * normal
     boxes: list[Contact] = []
     bodies, centers, radii, index = [], [], [], []
     for k, touching in on:
@@ -208,4 +211,4 @@ def _between(model: Any, data: Any, groups: dict[int, Group], on: list) -> BallB
         pairs.append(tuple(owner.number for owner in owners))
         centers.append([owner.local(data.geom_xpos[g]) for owner, g in zip(owners, geoms, strict=True)])
         radii.append([float(model.geom_size[g, 0]) for g in geoms])
-    return BallBall(pairs, np.array(centers), np.array(radii), [k for k, _ in on])
+    return BallBall(pairs, np.array(centers), np.array(radii), [k for k, _ in on], [t.margin for _, t in on])

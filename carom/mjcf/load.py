@@ -13,10 +13,17 @@ from jaxtyping import Array, Float
 from carom.checks import as_floats, is_share, optional_package, require, require_values
 from carom.errors import CaromError
 from carom.mechanics.potentials import Gravity
-from carom.mjcf.bodies import bodies_of, connects_of, groups_of, joints_of, loops_of, placed, state_of
+from carom.mjcf.actuators import actuators_of
+from carom.mjcf.bodies import bodies_of, groups_of, is_off, joints_of, placed, state_of
 from carom.mjcf.contacts import contact_refusals, contacts_of, fix_mocap, touching_pairs
+from carom.mjcf.equalities import connects_of, couplings_of, loops_of, welds_of
+from carom.mjcf.forces import carried, fluid_of, rotors_of, springs_of
+from carom.mjcf.limits import dry_friction_of, limits_of
 from carom.mjcf.refusals import check_ignore, refusals, refuse
 from carom.system import System
+
+ACTUATION = 1 << 11
+"""mjDSBL_ACTUATION"""
 
 
 class MujocoModel(NamedTuple):
@@ -68,29 +75,66 @@ def load_mujoco(
     if "mocap" in ignored:
         touching = fix_mocap(model, touching)
     urdf = _is_urdf(source)
-    refuse([*refusals(mujoco, model, urdf=urdf), *contact_refusals(model, touching, urdf=urdf)], ignored)
+    refuse([*refusals(mujoco, model), *contact_refusals(model, touching, urdf=urdf)], ignored)
     free = "joint of type floating" if urdf else "freejoint"
     require(model.nv > 0, f"the model has no joints: nothing in it moves. Give a body a {free}, for one.")
+    _leave_out(model, ignored)
     reference = placed(mujoco, model, model.qpos0)
     groups = groups_of(model, reference)
-    links = joints_of(model, reference, groups)
+    joints = joints_of(model, reference, groups)
+    links = [*joints, *welds_of(mujoco, model, reference, groups), *couplings_of(mujoco, model, joints)]
     links += connects_of(mujoco, model, reference, groups, loops_of(mujoco, model), qpos)
     found = contacts_of(model, reference, groups, touching)
-    weightless = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    # Limits and dry friction have one more contact property: without friction and rebound.
+    last, frictions = len(found.friction), list(found.friction)
+    inner = [*limits_of(mujoco, model, joints, last), *dry_friction_of(mujoco, model, joints, last)]
+    names = found.names
+    if inner:
+        frictions, names = [*frictions, 0.0], (*names, "limits and dry friction of joints")
     system = System(
         bodies_of(model, reference, groups),
         links,
-        found.contacts,
-        Gravity(np.zeros(3) if weightless else np.array(model.opt.gravity)),
-        found.friction or 0.0,
-        restitution,
+        [*found.contacts, *inner],
+        Gravity(np.zeros(3) if is_off(mujoco, model, "GRAVITY") else np.array(model.opt.gravity)),
+        frictions or 0.0,
+        [restitution] * last + [0.0] * bool(inner) if frictions else restitution,
+        forces=[
+            *springs_of(mujoco, model),
+            *carried(mujoco, model, reference, groups),
+            *fluid_of(model, reference, groups),
+            *actuators_of(mujoco, model),
+        ],
+        rotors=rotors_of(model),
         dim=3,
     )
     x0, v0 = state_of(mujoco, model, reference, groups, qpos, qvel)
-    names = tuple(group.name for group in groups.values() if group.number is not None)
+    bodies = tuple(group.name for group in groups.values() if group.number is not None)
     return MujocoModel(
-        system, as_floats(jnp.asarray(x0)), as_floats(jnp.asarray(v0)), float(model.opt.timestep), names, found.names
+        system, as_floats(jnp.asarray(x0)), as_floats(jnp.asarray(v0)), float(model.opt.timestep), bodies, names
     )
+
+
+def _leave_out(model: Any, ignored: Collection[str]) -> None:
+    """Take from the model what carom could represent, but is not to."""
+    fields = {
+        "stiffness": ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
+        "damping": ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly"),
+        "armature": ("dof_armature", "tendon_armature"),
+        "frictionloss": ("dof_frictionloss", "tendon_frictionloss"),
+        "limits": ("jnt_limited", "tendon_limited"),
+        "gravcomp": ("body_gravcomp",),
+        "equality": ("eq_active0",),
+    }
+    for kind in ignored:
+        for field in fields.get(kind, ()):
+            getattr(model, field)[:] = 0
+    if "fluid" in ignored:
+        model.opt.density = model.opt.viscosity = 0.0
+    if "actuators" in ignored:
+        model.opt.disableflags |= ACTUATION
+    if "tendons" in ignored:
+        for field in ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature", "frictionloss", "limited"):
+            getattr(model, f"tendon_{field}")[:] = 0
 
 
 def _read(mujoco: Any, source: str | os.PathLike[str]) -> Any:

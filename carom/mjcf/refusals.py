@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from carom.checks import require
-from carom.mjcf.bodies import name_of
+from carom.mjcf.actuators import unknown_actuators
+from carom.mjcf.bodies import WRAP_JOINT, name_of
 
 SHOWN = 3
 """How many names of one kind an error gives."""
@@ -39,16 +40,21 @@ def _nonzero(*fields) -> np.ndarray:
     return np.any(np.column_stack(fields), axis=1)
 
 
-def _joints(model: Any, *fields) -> np.ndarray:
-    """The same for joints, with fields of degrees of freedom."""
-    return np.bincount(model.dof_jntid[_nonzero(*fields)], minlength=model.njnt) > 0
+def _spatial(model: Any) -> np.ndarray:
+    """Tendons that go through space, or plastic ones."""
+    found = np.array(model.tendon_springyield, float) != 0
+    for k in range(model.ntendon):
+        wraps = slice(int(model.tendon_adr[k]), int(model.tendon_adr[k] + model.tendon_num[k]))
+        found[k] |= bool(np.any(model.wrap_type[wraps] != WRAP_JOINT))
+    return found
 
 
 def _equalities(mujoco: Any, model: Any) -> Refused:
     kinds = {int(value): name.removeprefix("mjEQ_").lower() for name, value in mujoco.mjtEq.__members__.items()}
-    other = (np.asarray(model.eq_type) != int(mujoco.mjtEq.mjEQ_CONNECT)) & np.asarray(model.eq_active0, bool)
+    known = [int(mujoco.mjtEq.__members__[f"mjEQ_{name}"]) for name in ("CONNECT", "WELD", "JOINT", "TENDON")]
+    other = ~np.isin(model.eq_type, known) & np.asarray(model.eq_active0, bool)
     names = tuple(_equality(mujoco, model, kinds[int(model.eq_type[k])], int(k)) for k in np.flatnonzero(other))
-    return Refused("equality", names, "use connect, or weld bodies by nesting them")
+    return Refused("equality", names, "carom has connect, weld, and those of joints and fixed tendons")
 
 
 def _equality(mujoco: Any, model: Any, kind: str, k: int) -> str:
@@ -62,8 +68,11 @@ def _equality(mujoco: Any, model: Any, kind: str, k: int) -> str:
 
 
 def _options(mujoco: Any, model: Any) -> Refused:
-    names = ["density and viscosity"] if model.opt.density or model.opt.viscosity else []
-    return Refused("fluid", tuple(names), "set both to 0")
+    if not (model.opt.density or model.opt.viscosity):
+        return Refused("fluid", (), "")
+    shaped = np.flatnonzero(np.asarray(model.geom_fluid)[:, 0])
+    names = [f"geom {name_of(model, 'geom', int(g))}" for g in shaped] + ["wind"] * bool(np.any(model.opt.wind))
+    return Refused("fluid", tuple(names), "carom has a medium at rest that acts on inertia boxes: leave out fluidshape")
 
 
 def _override(mujoco: Any, model: Any) -> Refused:
@@ -79,25 +88,34 @@ def _count(kind: str, field: str, advice: str):
     return find
 
 
+def _springs(mujoco: Any, model: Any) -> np.ndarray:
+    """Joints whose springs carom has not: those of what is free, balls that rest elsewhere, and those that yield."""
+    there = _nonzero(model.jnt_stiffness, model.jnt_stiffnesspoly)
+    kind, start = np.asarray(model.jnt_type), np.asarray(model.jnt_qposadr)
+    moved = [
+        k == BALL_JOINT and not np.array_equal(model.qpos_spring[a : a + 4], model.qpos0[a : a + 4])
+        for k, a in zip(kind, start, strict=True)
+    ]
+    return there & ((kind == FREE_JOINT) | np.array(moved, bool) | (np.asarray(model.jnt_springyield) != 0))
+
+
+FREE_JOINT, BALL_JOINT = 0, 1
+"""mjtJoint"""
+
 RULES: dict[str, Callable[[Any, Any], Refused]] = {
-    "actuators": _of("actuators", "actuator", "carom's simulate takes `force`", lambda m: np.ones(m.nu)),
-    "tendons": _of("tendons", "tendon", "remove them", lambda m: np.ones(m.ntendon)),
-    "limits": _of("limits", "joint", 'set limited="false"', lambda m: m.jnt_limited),
+    "actuators": _of(
+        "actuators",
+        "actuator",
+        "carom has those with an affine law on joints and fixed tendons",
+        unknown_actuators,
+    ),
+    "tendons": _of("tendons", "tendon", "carom has fixed tendons; remove those that go through space", _spatial),
     "stiffness": _of(
         "stiffness",
         "joint",
-        "set it to 0, or use carom.Springs",
-        lambda m: _nonzero(m.jnt_stiffness, m.jnt_stiffnesspoly),
+        "of a free joint, of a ball that is slack elsewhere, or one that yields: set it to 0",
+        lambda m: _springs(None, m),
     ),
-    "damping": _of(
-        "damping",
-        "joint",
-        "set it to 0",
-        lambda m: _joints(m, m.dof_damping, m.dof_dampingpoly),
-    ),
-    "armature": _of("armature", "joint", "set it to 0", lambda m: _joints(m, m.dof_armature)),
-    "frictionloss": _of("frictionloss", "joint", "set it to 0", lambda m: _joints(m, m.dof_frictionloss)),
-    "gravcomp": _of("gravcomp", "body", "set it to 0", lambda m: m.body_gravcomp),
     "mocap": _of("mocap", "body", 'set mocap="false"', lambda m: np.asarray(m.body_mocapid) >= 0),
     "equality": _equalities,
     "fluid": _options,
@@ -109,33 +127,20 @@ RULES: dict[str, Callable[[Any, Any], Refused]] = {
 
 CONTACT_KINDS = ("contacts", "rolling", "anisotropic", "margin", "adhesion", "surfacevel")
 """Kinds that `contacts.py` finds."""
-KINDS = (*RULES, *CONTACT_KINDS)
+LEFT_OUT = ("limits", "damping", "armature", "frictionloss", "gravcomp")
+"""Kinds that carom has, and can leave out."""
+KINDS = (*RULES, *CONTACT_KINDS, *LEFT_OUT)
 
 
-URDF_ADVICE = {
-    "limits": "leave out lower and upper in its <limit>",
-    "damping": "set damping of its <dynamics> to 0",
-    "frictionloss": "set friction of its <dynamics> to 0",
-    "equality": "leave out <mimic>",
-}
-"""What to do in a URDF file, which has other words than MJCF."""
-
-
-def refusals(mujoco: Any, model: Any, *, urdf: bool = False) -> list[Refused]:
-    """All that is in the model, without contacts; `urdf`, whether the advice is for such a file."""
+def refusals(mujoco: Any, model: Any) -> list[Refused]:
+    """All that is in the model, without contacts."""
     found = [rule(mujoco, model) for rule in RULES.values()]
-    if urdf:
-        found = [refused._replace(advice=URDF_ADVICE.get(refused.kind, refused.advice)) for refused in found]
     off, flags = model.opt.disableflags, mujoco.mjtDisableBit
     # What MuJoCo itself is told to leave out does nothing.
     silent = {
-        "limits": flags.mjDSBL_LIMIT | flags.mjDSBL_CONSTRAINT,
-        "frictionloss": flags.mjDSBL_FRICTIONLOSS | flags.mjDSBL_CONSTRAINT,
         "equality": flags.mjDSBL_EQUALITY | flags.mjDSBL_CONSTRAINT,
         "stiffness": flags.mjDSBL_SPRING,
-        "damping": flags.mjDSBL_DAMPER,
         "actuators": flags.mjDSBL_ACTUATION,
-        "gravcomp": flags.mjDSBL_GRAVITY,
     }
     return [refused for refused in found if refused.names and not off & int(silent.get(refused.kind, 0))]
 

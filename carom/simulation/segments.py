@@ -153,6 +153,7 @@ class Segments:
         self.rate, self.after = motion
         # Nothing in the search for events is differentiated, the system's own geometry included.
         self.still = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, system)
+        self.dry, self.loss = system.dry_friction()
 
     def __call__(self, now: Progress, count: Int[Array, ""]) -> Progress:
         """From `now` to the next event, or to the end of the step; `count` segments have been before."""
@@ -183,7 +184,7 @@ class Segments:
                 jax.jit(lambda: self.touching(state, now.left)),
                 lambda: (state, jnp.zeros_like(state.pressing)),
             )
-            state, held = jax.jit(lambda: self.act(state, change, first, count))()
+            state, held = jax.jit(lambda: self.act(state, change, first, count, now.left))()
             return jax.lax.cond(first, jax.jit(lambda: self.move(state, held, now, count)), lambda: state), None
 
         end, _ = jax.lax.scan(end_of, start, jnp.array([True, False]))
@@ -216,6 +217,7 @@ class Segments:
         gain = jnp.sum(jnp.linalg.norm(steps, axis=-1), axis=1)
         normal, gap = jax.lax.stop_gradient((jnp.sum(by_body[..., 0], axis=1), gap))
         lasts = (gap <= _NEAR * left * gain) & (normal >= -_CLOSING * gain) & (normal <= _LEAVING * gain)
+        lasts = lasts | self.dry
         if not has_impulses(self.system, state.x, state.v, self.stepper):
             lasts = jnp.zeros_like(lasts)
         state = state._replace(
@@ -227,7 +229,12 @@ class Segments:
         return state, left * jnp.sum(changes, axis=1)
 
     def act(
-        self, state: _Segment, change: Float[Array, "C d"], first: Bool[Array, ""], count: Int[Array, ""]
+        self,
+        state: _Segment,
+        change: Float[Array, "C d"],
+        first: Bool[Array, ""],
+        count: Int[Array, ""],
+        left: Float[Array, ""],
     ) -> tuple[_Segment, Float[Array, "C d"]]:
         """Let contacts act at an end of a segment: those that last are held, the others hit.
 
@@ -238,7 +245,7 @@ class Segments:
         contacts = closed_contacts(system, state.x, state.v, self.inverse_mass, stepper, state.closed)
         index, active = contacts.active.candidate, contacts.active.active
         k, d = contacts.velocity.shape
-        held = state.lasts[index] & active
+        held, dry = state.lasts[index] & active, jnp.asarray(self.dry)[index]
         past = jnp.where(held[:, None], state.time * state.pressing[index], 0)
         before = contacts.velocity + jnp.where(first, change[index], 0)
         free = before - (contacts.delassus @ past.reshape(-1)).reshape(k, d)
@@ -246,6 +253,7 @@ class Segments:
             # A gap that is left may close, in as many steps as a penetration is undone in.
             room = jnp.maximum(contacts.active.gap, 0) / (stepper.dt * compensation_steps_of(stepper))
             free = free.at[:, 0].add(jnp.where(held, room, 0))
+        contacts, free = self.with_dry_friction(contacts, free, jnp.where(first, left, state.time))
         together = islands(contacts.delassus, d)
         reference = jnp.maximum(jnp.abs(free), jnp.abs(before))
         slow = jnp.minimum(_REBOUNDS[stepper.impact] * jnp.exp2(count.astype(before.dtype) / 2), 1.0)
@@ -258,7 +266,8 @@ class Segments:
 
         def part(acting: Acting, hits: Bool[Array, ""]):
             hit = active & ~held & (acting.velocity[:, 0] < 0) & ~first
-            these = jnp.where(hits, active & jnp.any(together & hit, axis=1), held)
+            # In no time dry friction does nothing.
+            these = jnp.where(hits, active & ~dry & jnp.any(together & hit, axis=1), held)
             restitution = jnp.where(hits, rebounds, 0)
             problem = _only(contacts, these, jnp.where(hits, acting.velocity, free), reference, restitution)
             problem = problem._replace(rebounds=hits)
@@ -285,6 +294,26 @@ class Segments:
             lambda: (*self.after_impact(new, contacts, hit_jump, kick, acting.velocity), jnp.any(active)),
         )
         return new._replace(x=rest[0], v=rest[1], contact=rest[2]), wanted
+
+    def with_dry_friction(
+        self, contacts: ContactState, free: Float[Array, "K d"], time: Float[Array, ""]
+    ) -> tuple[ContactState, Float[Array, "K d"]]:
+        """Dry friction of joints over a `time` (s), as contacts that are pressed together by an impulse that is known.
+
+        Their normal is a coordinate of its own, of the tangent's mobility, which no other contact moves: what stops it
+        is that impulse.
+        """
+        if not self.dry.any():
+            return contacts, free
+        d = free.shape[1]
+        dry = jnp.asarray(self.dry)[contacts.active.candidate] & contacts.active.active
+        mobility = jnp.diagonal(contacts.delassus)
+        own = jnp.where(dry, mobility[1::d], 0)
+        delassus = contacts.delassus + jnp.diag(jnp.zeros_like(mobility).at[::d].set(own))
+        pressed = -own * self.loss[contacts.active.candidate] * time
+        free = free.at[:, 0].set(jnp.where(dry, pressed, free[:, 0]))
+        friction = jnp.where(dry, 1, contacts.friction)
+        return contacts._replace(delassus=delassus, friction=friction), free
 
     def rebounds(self, contacts: ContactState, velocity, gain, slow, together) -> Float[Array, " K"]:
         """The restitutions, or none where an island's hardest hit is too `slow` to matter.
