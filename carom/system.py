@@ -379,12 +379,16 @@ class System(eqx.Module):
     def acceleration(
         self, x: Float[Array, "n d"], v: Float[Array, "n d"], control: Float[Array, " u"] | None = None
     ) -> Float[Array, "n d"]:
-        """Accelerations (m/s^2) of the points without contact, with `control` of the actuators, by default none."""
+        """Accelerations (m/s^2) of the points without contact, with `control` of the actuators, by default none.
+
+        What has dynamics is taken to have followed its control, or, where it integrates, to stand at it.
+        """
         motors = self.actuators
         signal = None
         if motors is not None:
             control = jnp.zeros(motors.count, x.dtype) if control is None else jnp.asarray(control, x.dtype)
-            signal = signal_of(motors, control, control).start
+            held = jnp.clip(control, motors.control_range[:, 0], motors.control_range[:, 1])
+            signal = signal_of(motors, control, held).start
         return lagrangian_field(
             x,
             v,

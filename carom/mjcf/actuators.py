@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from carom.mechanics.forces import Actuators, Dynamics
 from carom.mjcf.bodies import is_off, name_of, tendon_gears
@@ -13,7 +13,7 @@ JOINT, IN_PARENT, TENDON = 0, 1, 3  # mjtTrn
 SCALAR = (2, 3)  # mjtJoint: slides and hinges
 
 
-def unknown_actuators(model: Any) -> Float[np.ndarray, " u"]:
+def unknown_actuators(model: Any) -> Bool[np.ndarray, " u"]:
     """Which actuators carom cannot represent: muscles, those of sites, of space, with a delay, and so on."""
     kinds = np.array([_gear(model, k) is not None for k in range(model.nu)], bool)
     fine = kinds & np.isin(model.actuator_dyntype, list(DYNAMICS)) & (model.actuator_gaintype <= 1)

@@ -213,7 +213,8 @@ def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence
         )
     require(
         not (balls and hinges),
-        f"body '{group.name}' has a ball joint and hinges. Remove these: a ball joint allows all rotations.",
+        f"body '{group.name}' has a ball joint and other joints that turn it. Remove these: a ball joint "
+        "allows all rotations.",
     )
     turning = [data.xanchor[j] for j, kind in zip(joints, kinds, strict=True) if kind != "slide"]
     point = turning[0] if turning else group.place
@@ -232,7 +233,7 @@ def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence
         group.first,
         parent.first,
         kinds,
-        [group.directions(data.xaxis[j]) for j in joints],
+        group.directions(data.xaxis[list(joints)]),
         [group.local(anchor) for anchor in anchors],
         parent.local(anchors[0]),
         parent.axes.T @ group.axes,

@@ -211,4 +211,4 @@ def _between(model: Any, data: Any, groups: dict[int, Group], on: list) -> BallB
         pairs.append(tuple(owner.number for owner in owners))
         centers.append([owner.local(data.geom_xpos[g]) for owner, g in zip(owners, geoms, strict=True)])
         radii.append([float(model.geom_size[g, 0]) for g in geoms])
-    return BallBall(pairs, np.array(centers), np.array(radii), [k for k, _ in on], [t.margin for _, t in on])
+    return BallBall(pairs, np.array(centers), np.array(radii), [k for k, _ in on], np.array([t.margin for _, t in on]))

@@ -146,7 +146,8 @@ def closed_contacts(
     else:
         free = jnp.einsum("rid,rid->r", rows, response)
         response = saddle.project_exactly(response)  # a large impulse shows its rounding
-        rows, response, delassus = _held(rows, response, free, d, system, x)
+        dry = jnp.asarray(system.dry_friction()[0])[active.candidate] & active.active
+        rows, response, delassus = _held(rows, response, free, d, system, x, dry)
     delassus = (delassus + delassus.T) / 2
     velocity = jnp.einsum("rid,id->r", rows, v).reshape(k, d)
     friction = system.friction[active.property_index]
@@ -202,6 +203,7 @@ def _held(
     d: int,
     system: System,
     x: Float[Array, "n d"],
+    dry: Bool[Array, " K"],
 ) -> tuple[Float[Array, "r n d"], Float[Array, "r n d"], Float[Array, "r r"]]:
     """Rows and responses `R = M^^-1 J_C^T` of contacts on bodies that joints hold, and their Delassus matrix.
 
@@ -215,7 +217,12 @@ def _held(
     if system.rotors is not None:
         turning = jax.vmap(lambda v: system.rotor_rates(x, v))(response)
         delassus = delassus + (turning * system.rotors.inertia) @ turning.T
-    moves = jnp.diagonal(delassus)[::d] > jnp.finfo(free.dtype).eps * free[::d]
+    # Dry friction has no normal, but a tangent.
+    moves = jnp.where(
+        dry,
+        jnp.diagonal(delassus)[1::d] > jnp.finfo(free.dtype).eps * free[1::d],
+        jnp.diagonal(delassus)[::d] > jnp.finfo(free.dtype).eps * free[::d],
+    )
     moves = jnp.repeat(moves, d)
     both = jnp.asarray(moves[:, None] & moves)
     rows, response = (jnp.asarray(jnp.where(moves[:, None, None], part, 0)) for part in (rows, response))
