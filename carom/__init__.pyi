@@ -14,6 +14,8 @@ from .contact.impulses import ContactModel as ContactModel
 from .contact.impulses import ContactState as ContactState
 from .contact.impulses import Coulomb as Coulomb
 from .contact.impulses import Jump as Jump
+from .contact.joint_limits import DryFriction as DryFriction
+from .contact.joint_limits import JointLimit as JointLimit
 from .contact.limits import BendLimit as BendLimit
 from .contact.limits import StretchLimit as StretchLimit
 from .contact.phases import contact_impulse as contact_impulse
@@ -50,6 +52,17 @@ from .mechanics.constraints import Pivot as Pivot
 from .mechanics.constraints import Tether as Tether
 from .mechanics.constraints import Track as Track
 from .mechanics.constraints import place_weights as place_weights
+from .mechanics.forces import Actuators as Actuators
+from .mechanics.forces import BodyDrag as BodyDrag
+from .mechanics.forces import Force as Force
+from .mechanics.forces import InertiaBoxFluid as InertiaBoxFluid
+from .mechanics.forces import JointDamping as JointDamping
+from .mechanics.forces import JointSpring as JointSpring
+from .mechanics.forces import PointDrag as PointDrag
+from .mechanics.forces import PointForce as PointForce
+from .mechanics.forces import Rotors as Rotors
+from .mechanics.joints import Coupling as Coupling
+from .mechanics.joints import Joints as Joints
 from .mechanics.potentials import Gravity as Gravity
 from .mechanics.potentials import NoPotential as NoPotential
 from .mechanics.potentials import Potential as Potential

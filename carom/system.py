@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from carom.checks import as_floats, at_once_if_known, is_share, not_negative, require, require_values
 from carom.contact.candidates import Active, Candidates, Contact, active_set, traced_candidates
-from carom.contact.impulses import ContactModel, contact_model_of
+from carom.contact.impulses import ContactModel, Coulomb, contact_model_of
 from carom.contact.joint_limits import DryFriction
 from carom.mechanics.bodies import (
     Body,
@@ -24,7 +24,7 @@ from carom.mechanics.bodies import (
 )
 from carom.mechanics.constraints import Constraint, Rigid
 from carom.mechanics.dynamics import lagrangian_field
-from carom.mechanics.forces import Actuators, Coordinates, Force, Rotors, signal_of
+from carom.mechanics.forces import Actuators, Coordinates, Force, JointDamping, JointSpring, Rotors, signal_of
 from carom.mechanics.joints import Joints
 from carom.mechanics.potentials import NoPotential, Potential
 
@@ -139,6 +139,15 @@ class System(eqx.Module):
                 f"Actuators gears must have a column for each of {self.n_coordinates} coordinates of joints; they had "
                 f"{motor.gears.shape[1]}.",
             )
+        for force in self.forces:
+            for name in ("stiffness", "rest", "viscous", "quadratic", "cubic"):
+                size = np.shape(getattr(force, name, 0.0))
+                own = getattr(force, "gears", None)
+                count = self.n_coordinates if own is None else own.shape[0]
+                require(
+                    not isinstance(force, JointSpring | JointDamping) or size in ((), (count,)),
+                    f"{type(force).__name__} {name} must be one number or {count}; its shape was {size}.",
+                )
         for contact in self.contacts:
             used = [b for bodies in contact.bodies_of() for b in bodies]
             require(
@@ -147,6 +156,7 @@ class System(eqx.Module):
                 f"{len(self.bodies)} (0 to {len(self.bodies) - 1}).",
             )
         self.friction, self.restitution = _properties(friction, restitution, self._property_index())
+        self._check_dry_friction()
         count = self.n_candidates
         default = count if count <= 4 else min(count, 2 * table.n_points)
         self.max_active = default if max_active is None else min(int(max_active), count)
@@ -191,10 +201,19 @@ class System(eqx.Module):
         )
         return found
 
+    def _check_dry_friction(self) -> None:
+        require(
+            not any(isinstance(contact, DryFriction) for contact in self.contacts)
+            or (isinstance(self.contact_model, Coulomb) and self.compensation == "mass"),
+            'DryFriction needs the contact model "coulomb" and compensation "mass"; use these, or leave it out.',
+        )
+
     def _with(self, name: str, value) -> "System":
         new = object.__new__(System)
         for field in dataclasses.fields(self):
             object.__setattr__(new, field.name, value if field.name == name else getattr(self, field.name))
+        if name in ("contact_model", "compensation"):
+            new._check_dry_friction()
         return new
 
     # --- structure -------------------------------------------------------------------------------------------
@@ -279,15 +298,13 @@ class System(eqx.Module):
             return jax.vmap(self.joint_velocities)(x, v)
         return jnp.concatenate([joint.rates(x, v) for joint in self.joints] or [jnp.zeros(0, x.dtype)])
 
-    def state_from_joints(
-        self, q: Float[Array, "*t q"], rates: Float[Array, "*t q"] | None = None
-    ) -> tuple[Float[Array, "*t n d"], Float[Array, "*t n d"]]:
-        """Positions (m) and velocities (m/s) of the points where the joints have these coordinates and rates.
+    def state_from_joints(self, q, rates=None) -> tuple[Float[Array, "*t n d"], Float[Array, "*t n d"]]:
+        """Positions (m) and velocities (m/s) of the points where the joints have these coordinates and rates, (*t, q).
 
         **Raises:** `CaromError` for shapes that do not fit, and for a body that no joint holds.
         """
-        q = jnp.asarray(q)
-        rates = jnp.zeros_like(q) if rates is None else jnp.asarray(rates)
+        q = jnp.asarray(q, float)
+        rates = jnp.zeros_like(q) if rates is None else jnp.asarray(rates, float)
         count = self.n_coordinates
         require(
             q.shape == rates.shape and q.shape[-1:] == (count,),

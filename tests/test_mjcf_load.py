@@ -356,25 +356,27 @@ def arm(joint="", geom="box", attributes="", inner="", more="", contact=False, b
 OTHER = '<body name="other" pos="1 0 0"><freejoint/><geom name="h" type="{}" size=".1 .1 .1"/></body>'
 REFUSED = {
     "actuators": (
-        arm(more='<actuator><motor name="m" joint="j"/></actuator>'),
-        "actuators (actuator 'm'; carom's simulate takes `force`)",
+        arm(more='<actuator><muscle name="m" joint="j" lengthrange="0 1"/></actuator>'),
+        "actuators (actuator 'm'; carom has those with an affine law on joints and fixed tendons)",
     ),
     "tendons": (
-        arm(more='<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
-        "tendons (tendon 't'; remove them)",
+        arm(
+            inner='<site name="here"/>',
+            before='<site name="there"/>',
+            more='<tendon><spatial name="t"><site site="here"/><site site="there"/></spatial></tendon>',
+        ),
+        "tendons (tendon 't'; carom has fixed tendons; remove those that go through space)",
     ),
-    "limits": (arm('range="-1 1" limited="true"'), "limits (joint 'j'; set limited=\"false\")"),
-    "stiffness": (arm('stiffness="1"'), "stiffness (joint 'j'; set it to 0, or use carom.Springs)"),
-    "damping": (arm('damping="1"'), "damping (joint 'j'; set it to 0)"),
-    "armature": (arm('armature="1"'), "armature (joint 'j'; set it to 0)"),
-    "frictionloss": (arm('frictionloss="1"'), "frictionloss (joint 'j'; set it to 0)"),
-    "gravcomp": (arm().replace('"arm"', '"arm" gravcomp="1"'), "gravcomp (body 'arm'; set it to 0)"),
+    "stiffness": (
+        world('<body name="ball"><joint name="j" type="free" stiffness="1"/><geom size=".1"/></body>'),
+        "stiffness (joint 'j'; of a free joint, of a ball that is slack elsewhere, or one that yields: set it to 0)",
+    ),
     "mocap": (arm(before='<body name="hand" mocap="true"/>'), "mocap (body 'hand'; set mocap=\"false\")"),
-    "equality": (
-        arm(before=OTHER.format("box"), more='<equality><weld name="w" body1="arm" body2="other"/></equality>'),
-        "equality (weld 'w'; use connect, or weld bodies by nesting them)",
+    "fluid": (
+        arm(attributes='fluidshape="ellipsoid"', option='density="1000"'),
+        "fluid (geom 'g'; carom has a medium at rest that acts on inertia boxes: leave out fluidshape)",
     ),
-    "fluid": (arm(option='density="1000"'), "fluid (density and viscosity; set both to 0)"),
+    "wind": (arm(option='density="1000" wind="1 0 0"'), "fluid (wind; carom has a medium at rest"),
     "box on box": (
         arm(before=OTHER.format("box"), contact=True),
         "contacts (box 'g' and box 'h'; carom has spheres, capsules and boxes on planes, and spheres on spheres",
@@ -390,10 +392,6 @@ REFUSED = {
     "condim": (
         arm(geom="sphere", attributes='condim="4"', before=FLOOR, contact=True),
         "rolling (sphere 'g' and plane 'floor'; torsional and rolling friction: set condim to 3)",
-    ),
-    "margin": (
-        arm(geom="sphere", attributes='margin=".1"', before=FLOOR, contact=True),
-        "margin (sphere 'g' and plane 'floor'; set margin and gap to 0)",
     ),
     "adhesion": (
         arm(geom="sphere", attributes='adhesion="1"', before=FLOOR, contact=True),
@@ -417,24 +415,22 @@ REFUSED = {
         "override (flag override",
     ),
     "no names": (
-        arm('damping="1"').replace('name="j"', "").replace('name="arm"', ""),
-        "damping (joint number 0 of body number 1; set it to 0)",
+        world('<body><joint type="free" stiffness="1"/><geom size=".1"/></body>'),
+        "stiffness (joint number 0 of body number 1; of a free joint",
     ),
-    "several": (arm('damping="1" armature="1"'), 'load_mujoco(..., ignore=("damping", "armature")).'),
+    "several": (
+        arm(
+            option='density="1000" wind="1 0 0"',
+            more='<actuator><muscle name="m" joint="j" lengthrange="0 1"/></actuator>',
+        ),
+        'load_mujoco(..., ignore=("actuators", "fluid")).',
+    ),
     "nothing moves": (world('<geom size=".1"/>'), "the model has no joints: nothing in it moves"),
     "a rod without width": (
         world(
             '<body name="rod"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .2"/></body>',
         ),
         "body 'rod' has the principal moments of inertia (0.1, 0.1, 0.2) kg m^2, of which one is not smaller",
-    ),
-    "a slide after a hinge": (
-        arm().replace("<geom", '<joint name="s" type="slide" axis="1 0 0"/><geom'),
-        "body 'arm' has the slide joint 's' after a hinge or ball joint",
-    ),
-    "hinges apart": (
-        arm().replace("<geom", '<joint name="k" axis="1 0 0" pos="0 0 .1"/><geom'),
-        "body 'arm' has the hinges 'j', 'k', which do not meet in one point",
     ),
     "hinges alike": (
         arm().replace("<geom", '<joint name="k" axis="0 0 1"/><geom'),
@@ -460,20 +456,23 @@ def test_what_cannot_be_represented_is_refused_by_name(xml, message):
 
 
 def test_named_kinds_are_left_out_knowingly():
-    xml = arm('damping="1" stiffness="2" range="-1 1" limited="true"')
-    with refused("stiffness"):
-        carom.load_mujoco(xml, ignore=("damping", "limits"))
-    loaded = carom.load_mujoco(xml, ignore=("damping", "limits", "stiffness"))
-    assert loaded.bodies == ("arm",)
+    """What carom has, too: such a model moves as MuJoCo's without it."""
+    xml = arm('damping="1" stiffness="2" armature="3" frictionloss="1" range="-1 1" limited="true"')
+    full = carom.load_mujoco(xml).system
+    assert (len(full.forces), full.n_candidates) == (2, 3)
+    kinds = ("damping", "limits", "stiffness", "armature", "frictionloss")
+    bare = carom.load_mujoco(xml, ignore=kinds).system
+    assert (bare.forces, bare.rotors, bare.contacts) == ((), None, ())
     for wrong in (("dampings",), "dampings"):
-        with refused("ignore may name actuators, tendons, limits") as error:
+        with refused("ignore may name actuators, tendons, stiffness") as error:
             carom.load_mujoco(xml, ignore=wrong)
         assert str(error.value).endswith("it named 'dampings'.")
 
 
-def test_what_mujoco_is_told_to_leave_out_is_not_refused():
+def test_what_mujoco_is_told_to_leave_out_does_nothing():
     xml = arm('damping="1" range="-1 1" limited="true"').replace("<flag", '<flag limit="disable" damper="disable"')
-    assert carom.load_mujoco(xml).bodies == ("arm",)
+    system = carom.load_mujoco(xml).system
+    assert (system.forces, system.contacts) == ((), ())
 
 
 @pytest.mark.parametrize("keyframe", ["gone", 1, -1])
@@ -510,9 +509,15 @@ def test_the_example_of_the_documentation_works(capsys):
     names: dict = {}
     exec(compile(re.findall(r"```python\n(.*?)```", page, re.S)[0], "mujoco.md", "exec"), names)
     printed = capsys.readouterr().out
-    assert 'ignore="damping"' in printed
+    assert "contacts (box 'crate' and sphere 'hand'; " in printed
+    assert 'ignore="contacts"' in printed
     assert "('upper', 'lower', 'crate')" in printed
-    assert names["model"].properties == ("sphere 'hand' and plane 'floor'", "box 'crate' and plane 'floor'")
-    np.testing.assert_allclose(names["model"].system.friction, [0.6, 1.0])
+    touching = ("sphere 'hand' and plane 'floor'", "box 'crate' and plane 'floor'")
+    assert names["model"].properties == (*touching, "limits and dry friction of joints")
+    np.testing.assert_allclose(names["system"].friction, [0.6, 1.0, 0.0])
+    assert names["system"].coordinate_names == ("shoulder", "elbow", *(f"crate:{k}" for k in range(6)))
     assert names["motion"].contact.any()
     assert 0.09 < names["crate"][-1, 2] < 0.12  # it has landed
+    shoulder, elbow = names["angles"][-1]
+    assert -0.3 < shoulder < 0.2  # it has been lifted
+    assert elbow == pytest.approx(np.radians(30), abs=2e-3)

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from systems import refused
-from test_mjcf_load import OTHER, ROUNDING, arm
+from test_mjcf_load import ROUNDING, arm
 
 import carom
 
@@ -19,10 +19,10 @@ def _where_logs_may_be_left(tmp_path, monkeypatch):
 
 
 def test_one_kind_may_be_a_string_and_the_advice_can_be_pasted():
-    xml = arm('damping="1"')
-    with refused('load_mujoco(..., ignore="damping").'):
+    xml = arm(more='<actuator><muscle name="m" joint="j" lengthrange="0 1"/></actuator>')
+    with refused('load_mujoco(..., ignore="actuators").'):
         carom.load_mujoco(xml)
-    assert carom.load_mujoco(xml, ignore="damping").bodies == ("arm",)
+    assert carom.load_mujoco(xml, ignore="actuators").bodies == ("arm",)
 
 
 MOCAP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="1 1 1"/>
@@ -65,36 +65,21 @@ def two_links(limit: str, dynamics: str = "", mimic: str = "") -> str:
         </robot>"""
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        (('lower="-1" upper="1"',), "limits (joint 'a'; leave out lower and upper in its <limit>)"),
-        (("", '<dynamics damping="1"/>'), "damping (joint 'a'; set damping of its <dynamics> to 0)"),
-        (("", '<dynamics friction="1"/>'), "frictionloss (joint 'a'; set friction of its <dynamics> to 0)"),
-        (("", "", '<mimic joint="a"/>'), "equality (joint equality of joint 'b' and 'a'; leave out <mimic>)"),
-    ],
-)
-def test_a_urdf_gets_advice_in_its_own_words(tmp_path, parts, message):
+def test_a_urdf_has_limits_damping_friction_and_mimic(tmp_path):
     path = tmp_path / "robot.urdf"
-    path.write_text('<?xml version="1.0"?><!-- not <mujoco> -->' + two_links(*parts))
-    with refused(message):
-        carom.load_mujoco(path)
-    assert carom.load_mujoco(two_links("")).bodies == ("one", "two")
-
-
-def test_equalities_without_a_name_are_told_by_what_they_couple():
-    two = arm(before=OTHER.format("box").replace("<freejoint/>", '<joint name="k"/>'))
-    for equality, text in (
-        ('<joint joint1="k" joint2="j"/>', "joint equality of joint 'k' and 'j'"),
-        ('<joint joint1="k"/>', "joint equality of joint 'k'; use connect"),
-        ('<weld body1="arm" body2="other"/>', "weld equality of body 'arm' and 'other'"),
-    ):
-        with refused(f"equality ({text}"):
-            carom.load_mujoco(two.replace("</worldbody>", f"</worldbody><equality>{equality}</equality>"))
+    dynamics, mimic = '<dynamics damping="2" friction="3"/>', '<mimic joint="a" multiplier="2" offset=".1"/>'
+    path.write_text('<?xml version="1.0"?><!-- not <mujoco> -->' + two_links('lower="-1" upper=".5"', dynamics, mimic))
+    system = carom.load_mujoco(path).system
+    limit, dry = system.contacts
+    np.testing.assert_allclose(limit.bounds, [-1, 0.5])
+    np.testing.assert_allclose(dry.loss, [3])
+    np.testing.assert_allclose(system.forces[0].viscous, [2, 0])
+    np.testing.assert_allclose(system.constraints(system.state_from_joints([0.3, 0.7])[0]), 0, atol=ROUNDING)
+    assert np.abs(system.constraints(system.state_from_joints([0.3, 0.6])[0])).max() > 0.05
 
 
 def test_wrong_arguments_are_told_before_what_the_model_has():
     with refused("restitution must be between 0 and 1; it was 2.0."):
         carom.load_mujoco("nothing.xml", restitution=2.0)
     with refused("the model has no keyframes: keyframe must be None; it was 'nope'."):
-        carom.load_mujoco(arm('damping="1"'), keyframe="nope")
+        carom.load_mujoco(arm(), keyframe="nope")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import tyro
 
 TaskName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-SystemName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK|FILE.py")]
+SystemName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK|FILE.py|FILE.xml")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 ContactModelName = Annotated[str, tyro.conf.arg(metavar="{cm,cmr,lcp,coulomb}")]
 CompensationSteps = float | Literal["auto"] | None

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from carom.atomic import write_whole
 from carom.cli.outcome import TEST_DATA, pictures, say_unexplained
-from carom.cli.systems import Chosen
+from carom.cli.systems import Chosen, copy_of
 from carom.errors import CaromError
 from carom.learning.estimation.estimate import Told, estimate
 from carom.learning.estimation.refine import MOST_POINTS
@@ -21,7 +21,7 @@ from carom.learning.estimation.verdict import Estimate, Fit
 from carom.learning.meetings import meetings
 from carom.learning.model_file import save_model
 from carom.learning.progress import LoopProgress
-from carom.learning.run import MODEL, REPORT, SYSTEM, TRUTH, RunFolder
+from carom.learning.run import MODEL, REPORT, TRUTH, RunFolder
 from carom.learning.unknowns.models import mass_ratios
 from carom.learning.unknowns.quantities import describe, matches
 from carom.recordings.files import load_recording, save_recording
@@ -92,7 +92,7 @@ def learn_by_estimator(
     held = None if test is None else load_observations(test, chosen.system)
     told = estimated(console, chosen.system, observations, learn, test=held, seed=seed)
     if chosen.source is not None:
-        write_whole(run.path / SYSTEM, chosen.source)
+        write_whole(copy_of(run, chosen.name), chosen.source)
     save_model(run.path / MODEL, told.system, impact=told.fit.impact_rule)
     run.write_json(TRUTH, None)
     shown, predicted = shown_motions(told)

@@ -18,7 +18,7 @@ from carom.checks import require
 from carom.cli.arguments import ContactModelName, FilePath, FolderPath, SystemName
 from carom.cli.estimation import is_for_estimator, learn_by_estimator, names_to_learn
 from carom.cli.outcome import TEST_DATA, estimates_and_fit, pictures, warn_if_far_off, what_is_told
-from carom.cli.systems import Chosen, choose, is_file
+from carom.cli.systems import Chosen, choose, copy_of, is_file
 from carom.cli.tables import evaluation_table, property_table, told_table
 from carom.cli.tosses import learn_and_measure
 from carom.contact.impulses import contact_model_of
@@ -29,7 +29,7 @@ from carom.learning.estimation.toss_config import TossConfig, tossed_names
 from carom.learning.estimation.tosses import can_learn_tosses
 from carom.learning.evaluate import evaluate
 from carom.learning.model_file import save_model
-from carom.learning.run import CONFIG, MODEL, REPORT, SYSTEM, TRUTH, RunFolder
+from carom.learning.run import CONFIG, MODEL, REPORT, TRUTH, RunFolder
 from carom.learning.training.devices import is_first, start_processes
 from carom.learning.training.train import LearnReport, learn, quantities
 from carom.learning.unknowns.quantities import Learned
@@ -109,7 +109,7 @@ class Learn:
                 f"the run in {run.path} was not started by this version's `carom learn` ({error}): give its options "
                 "by hand."
             ) from error
-        task = str(run.path / SYSTEM) if is_file(kept["task"]) else kept["task"]
+        task = str(copy_of(run, kept["task"])) if is_file(kept["task"]) else kept["task"]
         return cls(task, run.path, **files, **others, config=config, tosses=tosses)
 
     def after_interrupt(self) -> str:
@@ -173,7 +173,7 @@ class Learn:
             dataset, test = self.data_sets(chosen, console)
         # Resumed too: a kill may have come before them.
         if chosen.source is not None:
-            write_whole(run.path / SYSTEM, chosen.source)
+            write_whole(copy_of(run, chosen.name), chosen.source)
         save_recording(run.path / TEST_DATA, test)
         run.write_json(TRUTH, None if chosen.truth is None else quantities(truth))
         console.print(
@@ -209,7 +209,7 @@ class Learn:
             run = RunFolder.create(folder, settings)
         # Resumed too: a kill may have come before them.
         if chosen.source is not None:
-            write_whole(run.path / SYSTEM, chosen.source)
+            write_whole(copy_of(run, chosen.name), chosen.source)
         save_recording(run.path / TEST_DATA, test)
         console.print(
             f"Learning {chosen.name} from {train.n_trajectories} recorded tosses into {run.path}",
@@ -251,7 +251,7 @@ class Learn:
         """The system to learn, under the name that it was first given."""
         chosen = choose(self.task)
         first = None if self.from_run is None else RunFolder.open(self.from_run)
-        if first is not None and self.task == str(first.path / SYSTEM):
+        if first is not None and is_file(self.task) and self.task == str(copy_of(first, self.task)):
             return dataclasses.replace(chosen, name=first.read_json(CONFIG)["task"])
         return chosen
 

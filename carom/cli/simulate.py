@@ -19,6 +19,9 @@ from carom.simulation.impact import COMPENSATION_STEPS, ImpactRule
 from carom.simulation.rollout import simulate
 from carom.tasks import find_task, sample
 
+OF_ROBOTS = 2.0
+"""Seconds that a robot file's motion is simulated for by default."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
@@ -73,16 +76,21 @@ class Simulate:
         out = Path(f"{chosen.stem}.h5") if self.out is None else self.out
         check_writable(out)
         require(
-            self.initial is not None or not chosen.own,
+            self.initial is not None or not chosen.own or chosen.start is not None,
             f"initial is needed for {self.task}: give a file to start from its first states, --initial FILE.",
         )
         first = None if self.initial is None else load_recording(self.initial, task=chosen.task)
-        if first is not None:
+        start = chosen.start
+        if first is None and start is not None:
+            x0, v0 = start.x[None], start.v[None]
+        elif first is not None:
             x0, v0 = jnp.asarray(first.x[:, 0]), jnp.asarray(first.v[:, 0])
         else:
             x0, v0 = sample(system, jax.random.key(self.seed), self.trajectories)
         if first is not None and chosen.own:
             dt, steps = first.dt, int(first.length.max()) - 1
+        elif start is not None:
+            dt, steps = start.dt, max(1, round(OF_ROBOTS / (start.dt if self.dt is None else self.dt)))
         else:
             known = find_task(self.task)
             dt, steps = known.dt, known.steps

@@ -1,4 +1,4 @@
-"""Which system a command is about: a task's, by its name, or one of the user's own, from a Python file."""
+"""Which system a command is about: a task's, by its name, or one of the user's own, from a Python or robot file."""
 
 import dataclasses
 import hashlib
@@ -6,12 +6,15 @@ import runpy
 import sys
 import traceback
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Float
 
 from carom.checks import require
 from carom.errors import CaromError
 from carom.learning.model_file import load_model_into, read_model_header
 from carom.learning.run import CONFIG, MODEL, SYSTEM, RunFolder
+from carom.mjcf.load import load_mujoco, whole_xml
 from carom.recordings.files import load_recording
 from carom.recordings.observations import Observations, load_observations, task_in
 from carom.recordings.recording import Recording
@@ -24,18 +27,27 @@ UNKNOWN = "unknown"
 """What it calls the names of what is to be learned, if it says them."""
 
 
+class Start(NamedTuple):
+    """Where a robot file says that motion begins, (n, 3) in m and m/s, and its time step (s)."""
+
+    x: Float[Array, "n d"]
+    v: Float[Array, "n d"]
+    dt: float
+
+
 @dataclasses.dataclass(frozen=True)
 class Chosen:
     """A system that was asked for: `name`, as it was given; `source`, the bytes of its file if it is the user's own.
 
     Of a user's own the masses, friction and restitution need not be true: they are what the file says. `unknown`: the
-    names of the quantities that the file says are to be learned, if it does.
+    names of the quantities that the file says are to be learned, if it does; `start`, of a robot file.
     """
 
     name: str
     system: System
     source: bytes | None = None
     unknown: tuple[str, ...] = ()
+    start: Start | None = None
 
     @property
     def own(self) -> bool:
@@ -63,13 +75,23 @@ class Chosen:
         return None if self.source is None else hashlib.sha256(self.source).hexdigest()
 
 
+def is_robot(name: str) -> bool:
+    """Whether a name means an MJCF or URDF file."""
+    return name.lower().endswith((".xml", ".urdf"))
+
+
 def is_file(name: str) -> bool:
-    """Whether a name means a Python file, not a task."""
-    return name.endswith(".py")
+    """Whether a name means a Python or robot file, not a task."""
+    return name.endswith(".py") or is_robot(name)
+
+
+def copy_of(run: RunFolder, name: str) -> Path:
+    """Where a run folder keeps its own copy of the user's file."""
+    return run.path / (Path(SYSTEM).with_suffix(".xml") if is_robot(name) else SYSTEM)
 
 
 def choose(name: str) -> Chosen:
-    """The system of the task of this name, or of the Python file, which is run.
+    """The system of the task of this name, of the Python file, which is run, or of the MJCF or URDF file.
 
     **Raises:** `CaromError` for an unknown task, and for a file that is missing, fails, makes no `System`, or has
     an `unknown` that is no list of names.
@@ -77,6 +99,8 @@ def choose(name: str) -> Chosen:
     if not is_file(name):
         return Chosen(name, task(name))
     path = Path(name)
+    if is_robot(name):
+        return _robot(name, path)
     require(path.is_file(), f"task is the file {name!r}, which does not exist. `carom new {path.name}` writes one.")
     defined = _run_file(path)
     system, unknown = defined.get(VARIABLE), defined.get(UNKNOWN, ())
@@ -88,6 +112,12 @@ def choose(name: str) -> Chosen:
         f"{name} must set `{UNKNOWN}` to a list of names of quantities; it was {unknown!r}.",
     )
     return Chosen(name, system, path.read_bytes(), tuple(unknown))
+
+
+def _robot(name: str, path: Path) -> Chosen:
+    require(path.is_file(), f"task is the file {name!r}, which does not exist.")
+    loaded = load_mujoco(path)
+    return Chosen(name, loaded.system, whole_xml(path), start=Start(loaded.x0, loaded.v0, loaded.dt))
 
 
 def data_and_system(path: Path, name: str) -> tuple[Recording, Chosen | None, str]:
@@ -111,7 +141,7 @@ def _of_task(path: Path, its: str, chosen: Chosen | None, name: str) -> tuple[Ch
         if its in TASKS:
             return choose(its), ""
         known = f"is of {its!r}, which is no task of carom's" if its else "does not say of which task it is"
-        return None, f"{path} {known}. Give --task NAME, or --task FILE.py that sets `{VARIABLE}`."
+        return None, f"{path} {known}. Give --task NAME, or --task FILE.py that sets `{VARIABLE}`, or FILE.xml."
     differs = bool(its) and chosen.task not in (None, its)
     return chosen, f"{path} says that it is of {its!r}; it is taken as of {name!r}." if differs else ""
 
@@ -119,7 +149,7 @@ def _of_task(path: Path, its: str, chosen: Chosen | None, name: str) -> tuple[Ch
 def chosen_by(run: RunFolder) -> Chosen:
     """The system that a run learns: of its task, or of its own copy of the user's file."""
     name = run.read_json(CONFIG)["task"]
-    return choose(str(run.path / SYSTEM)) if is_file(name) else choose(name)
+    return choose(str(copy_of(run, name))) if is_file(name) else choose(name)
 
 
 def learned_system(folder: Path, name: str) -> tuple[System, dict[str, Any]]:

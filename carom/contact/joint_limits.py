@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from carom.checks import as_floats, not_negative, require, require_values
 from carom.contact.candidates import Candidates, Contact, property_indices
@@ -84,17 +84,30 @@ class JointLimit(JointReading):
 
     **Arguments:** `joints`, one or several, as they stand in the system's constraints; `gears` (c, q) over their
     coordinates, of one joint a unit row; `bounds` (c,) (rad, m); `sides` (c,): 1 for a lower bound, -1 for an upper
-    one; `margin` (c,), how far before the bound it holds; `property`, index into the system's restitution. For the
-    angle of a ball joint `gears` are three ones at its coordinates, `sides` -1, and `ball` is true.
+    one; `margin` (c,), how far before the bound it holds; `property`, index into the system's restitution. `ball`:
+    where the three coordinates of a ball joint begin, whose angle is limited in place of `gears q`.
     """
 
     bounds: Float[Array, " c"]
     sides: tuple[int, ...] = eqx.field(static=True)
     margin: Float[Array, " c"]
-    ball: bool = eqx.field(static=True)
+    ball: int | None = eqx.field(static=True)
 
-    def __init__(self, joints, gears, bounds, sides, margin=0.0, property=0, names=None, ball: bool = False):
+    def __init__(
+        self,
+        joints,
+        gears,
+        bounds,
+        sides,
+        margin: ArrayLike | Sequence[float] = 0.0,
+        property=0,
+        names=None,
+        ball: int | None = None,
+    ):
         super().__init__(joints, gears, property, names)
+        if names is None:
+            what = ("lower" if side > 0 else "upper" for side in sides)
+            self.labels = tuple(f"{name} {side} limit" for name, side in zip(self.labels, what, strict=False))
         count = len(self.property_index)
         self.bounds, self.sides = as_floats(bounds), tuple(int(side) for side in sides)
         self.margin, self.ball = as_floats(np.broadcast_to(np.asarray(margin, float), (count,))), ball
@@ -105,15 +118,15 @@ class JointLimit(JointReading):
         )
 
     def candidates(self, x, radii, table):
-        points, sides = self._points(), np.array(self.sides, x.dtype)
+        points, sides = self._points(), jnp.array(self.sides, x.dtype)
         length = self.gears @ self._read(x)
         rows = self._rates(x, points)
-        if self.ball:
-            vector = self._read(x)[np.asarray(self.gears[0]) != 0]
+        if self.ball is not None:
+            own = slice(self.ball, self.ball + 3)
+            vector = self._read(x)[own]
             square = jnp.sum(vector**2)
             length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)[None]
             way = vector / jnp.where(length > 0, length, 1)
-            own = np.flatnonzero(np.asarray(self.gears[0]))
             rows = self._replaced(jnp.zeros((1, self.gears.shape[1]), x.dtype).at[0, own].set(way))._rates(x, points)
         return self._candidates(sides * (length - self.bounds) - self.margin, sides[:, None, None] * rows, 0, points)
 

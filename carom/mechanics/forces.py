@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from carom.checks import as_floats, not_negative, require, require_values, whole
 from carom.mechanics.constraints import place_weights
@@ -60,7 +60,15 @@ class JointSpring(Force):
     cubic: Float[Array, "..."]
     gears: Float[Array, "s q"] | None
 
-    def __init__(self, stiffness, rest=0.0, deadband=0.0, quadratic=0.0, cubic=0.0, gears=None):
+    def __init__(
+        self,
+        stiffness,
+        rest: ArrayLike = 0.0,
+        deadband: ArrayLike = 0.0,
+        quadratic: ArrayLike = 0.0,
+        cubic: ArrayLike = 0.0,
+        gears=None,
+    ):
         self.stiffness, self.rest, self.deadband = as_floats(stiffness), as_floats(rest), as_floats(deadband)
         self.quadratic, self.cubic = as_floats(quadratic), as_floats(cubic)
         self.gears = None if gears is None else as_floats(gears)
@@ -69,8 +77,8 @@ class JointSpring(Force):
 
     def energy(self, q):
         length = q if self.gears is None else self.gears @ q
-        off = length - self.rest
-        off = jnp.sign(off) * jnp.maximum(jnp.abs(off) - self.deadband, 0)
+        off, slack = length - self.rest, self.deadband
+        off = jnp.where(off >= slack, off - slack, jnp.where(off <= -slack, off + slack, 0))
         return jnp.sum(self.stiffness * off**2 / 2 + self.quadratic * off**3 / 3 + self.cubic * off**4 / 4)
 
 
@@ -86,7 +94,7 @@ class JointDamping(Force):
     cubic: Float[Array, "..."]
     gears: Float[Array, "s q"] | None
 
-    def __init__(self, viscous, quadratic=0.0, cubic=0.0, gears=None):
+    def __init__(self, viscous, quadratic: ArrayLike = 0.0, cubic: ArrayLike = 0.0, gears=None):
         self.viscous, self.quadratic, self.cubic = as_floats(viscous), as_floats(quadratic), as_floats(cubic)
         self.gears = None if gears is None else as_floats(gears)
         for name, value in (("viscous", viscous), ("quadratic", quadratic), ("cubic", cubic)):
@@ -137,13 +145,13 @@ class Actuators(Force):
     def __init__(
         self,
         gears,
-        gain=1.0,
-        bias=0.0,
+        gain: ArrayLike = 1.0,
+        bias: ArrayLike = 0.0,
         control_range=None,
         force_range=None,
         activation_range=None,
         dynamics: Sequence[Dynamics] | None = None,
-        time_constant=1.0,
+        time_constant: ArrayLike = 1.0,
         names: Sequence[str] | None = None,
         torque_range=None,
     ):
@@ -199,7 +207,7 @@ class Signal(NamedTuple):
     rate: Float[Array, " u"]
     range: Float[Array, "u 2"]
 
-    def at(self, time: Float[Array, ""]) -> Float[Array, " u"]:
+    def at(self, time) -> Float[Array, " u"]:
         """Its value."""
         value = self.goal + self.slope * time + (self.start - self.goal) * jnp.exp(-self.rate * time)
         return jnp.clip(value, self.range[:, 0], self.range[:, 1])

@@ -25,6 +25,8 @@ from carom.mechanics.constraints import Constraint
 
 JointKind = Literal["hinge", "slide", "ball", "free"]
 JOINT_KINDS = get_args(JointKind)
+_SMALL = 1e-5
+"""Squares of angles below which series are exact to rounding."""
 
 
 class Joints(Constraint):
@@ -149,7 +151,7 @@ class Joints(Constraint):
         (turn, _), (change, _) = jax.jvp(self._relative, (x,), (v,))
         spin = self.frame @ _vector(turn.T @ change)
         last = self.count - 3
-        return jnp.where(np.arange(self.count) < last, rates, jnp.pad(spin, (last, 0)))
+        return jnp.asarray(jnp.where(np.arange(self.count) < last, rates, jnp.pad(spin, (last, 0))))
 
     def pose(
         self, q: Float[Array, " q"], turn: Float[Array, "d d"], place: Float[Array, " d"], change: Float[Array, " q"]
@@ -229,7 +231,7 @@ class Joints(Constraint):
         """The turn by a rotation vector in `frame`."""
         if self.dim == 2:
             return self._about(0, vector[0])
-        return Rotation.from_rotvec(self.frame.T @ vector).as_matrix()
+        return turn_by(self.frame.T @ vector)
 
     def _rotation_vector(self, moved: Float[Array, "d d"]) -> Float[Array, " w"]:
         if self.dim == 2:
@@ -341,7 +343,7 @@ class Coupling(Constraint):
         spans = [slice(end - joint.count, end) for joint, end in zip(joints, ends, strict=True)]
         used = [k for k, at in enumerate(spans) if np.any(np.asarray(first)[at]) or np.any(np.asarray(second)[at])]
         rows = [np.concatenate([np.asarray(row)[spans[k]] for k in used]) for row in (first, second)]
-        return cls([joints[k] for k in used], *rows, coefficients, zeros)
+        return cls([joints[k] for k in used], rows[0], rows[1], coefficients, zeros)
 
     def __call__(self, x):
         q = jnp.concatenate([joint.coordinates(x) for joint in self.joints])
@@ -420,7 +422,7 @@ def _angle_about(axis, start, end) -> Float[Array, ""]:
     return jnp.arctan2(axis @ jnp.cross(start, end), start @ end - (axis @ start) * (axis @ end))
 
 
-def across(axis: Float[Array, " 3"]) -> Float[Array, "e d"]:
+def across(axis: Float[Array, " d"]) -> Float[Array, "e d"]:
     """Unit vectors at right angles to a unit `axis` and to each other: two in 3D, one in 2D (T. Duff et al., *Building
     an Orthonormal Basis, Revisited*, 2017)."""
     if axis.shape[0] == 2:
@@ -432,6 +434,24 @@ def across(axis: Float[Array, " 3"]) -> Float[Array, "e d"]:
     return jnp.stack([jnp.stack([1 + s * x**2 * a, s * b, -s * x]), jnp.stack([b, s + y**2 * a, -y])])
 
 
+def turn_by(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """The rotation matrix of a rotation vector (rad) (Rodrigues), with a derivative at zero."""
+    square = jnp.sum(vector**2)
+    small = square < _SMALL
+    safe = jnp.where(small, 1.0, square)
+    angle = jnp.sqrt(safe)
+    sine = jnp.where(small, 1 - square / 6 + square**2 / 120, jnp.sin(angle) / angle)
+    cosine = jnp.where(small, 0.5 - square / 24 + square**2 / 720, (1 - jnp.cos(angle)) / safe)
+    cross = _cross(vector)
+    return jnp.eye(3, dtype=vector.dtype) + sine * cross + cosine * cross @ cross
+
+
 def rotation_vector(turn: Float[Array, "3 3"]) -> Float[Array, " 3"]:
-    """The rotation vector (rad) of a rotation matrix."""
-    return Rotation.from_matrix(turn).as_rotvec()
+    """The rotation vector (rad) of a rotation matrix, with a derivative where nothing is turned."""
+    vector, cosine = _vector(turn), (jnp.trace(turn) - 1) / 2
+    square = jnp.sum(vector**2)
+    wide = (cosine < 0) | (square > _SMALL)
+    quarter = jnp.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], turn.dtype)
+    far = Rotation.from_matrix(jnp.where(wide, turn, quarter)).as_rotvec()
+    near = vector * (1 + square / 6 + 3 * square**2 / 40)
+    return jnp.where(wide, far, near)

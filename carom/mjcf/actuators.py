@@ -19,7 +19,10 @@ def unknown_actuators(model: Any) -> Bool[np.ndarray, " u"]:
     fine = kinds & np.isin(model.actuator_dyntype, list(DYNAMICS)) & (model.actuator_gaintype <= 1)
     fine &= (model.actuator_biastype <= 1) & ~model.actuator_actearly.astype(bool) & (model.actuator_delay == 0)
     fine &= (model.actuator_damping == 0) & (model.actuator_armature == 0) & ~model.actuator_dampingpoly.any(axis=1)
-    return ~fine & bool(model.opt.disableactuator == 0)
+    fine &= model.opt.disableactuator == 0
+    if np.any(model.tendon_actfrclimited):
+        fine &= model.actuator_trntype != TENDON
+    return ~fine
 
 
 def _gear(model: Any, k: int) -> Float[np.ndarray, " nv"] | None:
@@ -73,7 +76,7 @@ def actuators_of(mujoco: Any, model: Any) -> list[Actuators]:
             ranges(model.actuator_actrange, model.actuator_actlimited),
             [DYNAMICS[int(model.actuator_dyntype[k])] for k in chosen],
             np.maximum(model.actuator_dynprm[chosen, 0], 1e-15),
-            [name_of(model, "actuator", int(k)).strip("'") for k in chosen],
+            [name_of(model, "actuator", int(k)).replace("'", "") for k in chosen],
             torque if limited.any() else None,
         )
     ]

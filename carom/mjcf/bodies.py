@@ -111,7 +111,7 @@ def groups_of(model: Any, data: Any) -> dict[int, Group]:
 def _group(model: Any, data: Any, root: int, number: int) -> Group:
     parts = np.flatnonzero(model.body_weldid == root)
     masses = np.array(model.body_mass[parts])
-    name = name_of(model, "body", root).strip("'")
+    name = name_of(model, "body", root).replace("'", "")
     require(masses.sum() > 0, f"body '{name}' has no mass: give it an <inertial> or a geom with a mass.")
     place = masses @ data.xipos[parts] / masses.sum()
     inertia = np.zeros((3, 3))
@@ -201,7 +201,7 @@ def joints_of(model: Any, data: Any, groups: dict[int, Group]) -> list[Joints]:
 
 def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence[int]) -> Joints:
     assert group.first is not None
-    kinds = [KINDS[int(model.jnt_type[joint])] for joint in joints]
+    kinds: list[JointKind] = [KINDS[int(model.jnt_type[joint])] for joint in joints]
     hinges, balls = (kinds.count(kind) for kind in ("hinge", "ball"))
     for kind, most in (("hinge", 3), ("slide", 3), ("ball", 1)):
         rows = np.array([data.xaxis[j] for j, k in zip(joints, kinds, strict=True) if k == kind])
@@ -240,5 +240,5 @@ def _joints(model: Any, data: Any, group: Group, parent: Group, joints: Sequence
         rest,
         near,
         data.xmat[group.root].reshape(3, 3).T @ group.axes,
-        [name_of(model, "joint", joint).strip("'") for joint in joints],
+        [name_of(model, "joint", joint).replace("'", "") for joint in joints],
     )

@@ -35,6 +35,8 @@ def couplings_of(mujoco: Any, model: Any, joints: list[Joints]) -> list[Constrai
             other = int(model.eq_obj2id[k])
             if other >= 0:
                 second = rows[other]
+            if not (first.any() or second.any()):
+                continue  # of tendons that are left out
             zeros = first @ rest, second @ rest
             found.append(Coupling.of(joints, first, second, model.eq_data[k, :5], zeros))
     return found

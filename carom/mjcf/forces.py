@@ -23,25 +23,27 @@ def springs_of(mujoco: Any, model: Any) -> list[Force]:
                 stiffness[at], more[:, at] = model.jnt_stiffness[j], model.jnt_stiffnesspoly[j][:, None]
                 rest[at] = 0 if width == 3 else model.qpos_spring[model.jnt_qposadr[j]]
         if stiffness.any() or more.any():
-            found.append(JointSpring(stiffness, rest, 0.0, *more))
+            found.append(JointSpring(stiffness, rest, 0.0, more[0], more[1]))
         some = np.flatnonzero(np.any([model.tendon_stiffness, *model.tendon_stiffnesspoly.T], axis=0))
         if len(some):
             low, high = model.tendon_lengthspring[some].T
             more = model.tendon_stiffnesspoly[some].T
             gears = tendon_gears(model)[some]
-            found.append(JointSpring(model.tendon_stiffness[some], (low + high) / 2, (high - low) / 2, *more, gears))
+            found.append(
+                JointSpring(model.tendon_stiffness[some], (low + high) / 2, (high - low) / 2, more[0], more[1], gears)
+            )
     if not is_off(mujoco, model, "DAMPER"):
         if model.dof_damping.any() or model.dof_dampingpoly.any():
-            found.append(JointDamping(model.dof_damping, *model.dof_dampingpoly.T))
+            found.append(JointDamping(model.dof_damping, model.dof_dampingpoly[:, 0], model.dof_dampingpoly[:, 1]))
         some = np.flatnonzero(np.any([model.tendon_damping, *model.tendon_dampingpoly.T], axis=0))
         if len(some):
             more = model.tendon_dampingpoly[some].T
-            found.append(JointDamping(model.tendon_damping[some], *more, tendon_gears(model)[some]))
+            found.append(JointDamping(model.tendon_damping[some], more[0], more[1], tendon_gears(model)[some]))
     return found
 
 
 def rotors_of(model: Any) -> Rotors | None:
-    """Armature of joints, of fixed tendons and of actuators."""
+    """Armature of joints and of fixed tendons."""
     gears, inertia = [*np.eye(model.nv)[model.dof_armature > 0]], [*model.dof_armature[model.dof_armature > 0]]
     for k in np.flatnonzero(model.tendon_armature):
         gears.append(tendon_gears(model)[k])

@@ -23,12 +23,12 @@ def limits_of(mujoco: Any, model: Any, joints: list[Joints], property: int) -> l
         span = np.arange(first, first + joint.count)
         first += joint.count
         for j in np.flatnonzero(np.isin(model.jnt_dofadr, span) & np.asarray(model.jnt_limited, bool)):
-            at, name = int(model.jnt_dofadr[j]) - int(span[0]), name_of(model, "joint", int(j)).strip("'")
+            at, name = int(model.jnt_dofadr[j]) - int(span[0]), name_of(model, "joint", int(j)).replace("'", "")
             low, high = (float(bound) for bound in model.jnt_range[j])
             margin = float(model.jnt_margin[j])
             if model.jnt_type[j] == BALL:
                 row = np.isin(np.arange(joint.count), range(at, at + 3))[None].astype(float)
-                found.append(JointLimit(joint, row, [max(low, high)], [-1], margin, property, [name], ball=True))
+                found.append(JointLimit(joint, row, [max(low, high)], [-1], margin, property, [name], ball=at))
                 continue
             for bound, side, what in ((low, 1, "lower"), (high, -1, "upper")):
                 rows.append(np.eye(joint.count)[at])
@@ -43,7 +43,7 @@ def limits_of(mujoco: Any, model: Any, joints: list[Joints], property: int) -> l
         if gears[k].any():
             used, row = _used(joints, gears[k])
             low, high = (float(bound) for bound in model.tendon_range[k])
-            name = name_of(model, "tendon", int(k)).strip("'")
+            name = name_of(model, "tendon", int(k)).replace("'", "")
             names = [f"{name} lower limit", f"{name} upper limit"]
             found.append(
                 JointLimit(used, [row, row], [low, high], [1, -1], float(model.tendon_margin[k]), property, names)
@@ -67,7 +67,7 @@ def dry_friction_of(mujoco: Any, model: Any, joints: list[Joints], property: int
     gears = tendon_gears(model)
     for k in np.flatnonzero(model.tendon_frictionloss):
         used, row = _used(joints, gears[k])
-        name = name_of(model, "tendon", int(k)).strip("'")
+        name = name_of(model, "tendon", int(k)).replace("'", "")
         found.append(
             DryFriction(used, row[None], [float(model.tendon_frictionloss[k])], property, [f"{name} dry friction"])
         )

@@ -54,12 +54,13 @@ def load_mujoco(
 
     - `source`: path of the file, or its XML.
     - `keyframe`: name or number of the keyframe to start from; by default, MuJoCo's reference position at rest.
-    - `ignore`: a kind of elements that carom cannot represent and that are to be left out, such as `"damping"`, or
-      several. A mocap body that is ignored stays where it is.
+    - `ignore`: a kind of elements that are to be left out, such as `"contacts"`, or several: what carom cannot
+      represent, or what it can, such as `"damping"`. A mocap body that is ignored stays where it is.
     - `restitution`: Poisson's e in [0, 1] of all contacts: MuJoCo has none.
 
-    Bodies with free, ball, hinge and slide joints, welded bodies (merged), `connect` equalities, gravity; contacts of
-    spheres, capsules and boxes with planes, and of spheres with spheres, with sliding friction. See docs/mujoco.md.
+    Bodies with free, ball, hinge and slide joints, their limits, springs, damping, armature and dry friction; fixed
+    tendons, actuators, equalities; gravity and fluids; contacts of spheres, capsules and boxes with planes, and of
+    spheres with spheres, with sliding friction. See docs/mujoco.md.
 
     **Raises:** `CaromError` if mujoco is missing, for files that it cannot read, an unknown keyframe, and for
     everything that carom cannot represent, by name.
@@ -128,6 +129,8 @@ def _leave_out(model: Any, ignored: Collection[str]) -> None:
     for kind in ignored:
         for field in fields.get(kind, ()):
             getattr(model, field)[:] = 0
+    if "margin" in ignored:
+        model.geom_margin[:] = model.pair_margin[:] = 0
     if "fluid" in ignored:
         model.opt.density = model.opt.viscosity = 0.0
     if "actuators" in ignored:
@@ -146,6 +149,20 @@ def _read(mujoco: Any, source: str | os.PathLike[str]) -> Any:
         return mujoco.MjModel.from_xml_string(text) if inline else mujoco.MjModel.from_xml_path(text)
     except ValueError as error:
         raise CaromError(f"MuJoCo cannot read {what}: {' '.join(str(error).split())}") from None
+
+
+def whole_xml(path: str | os.PathLike[str]) -> bytes:
+    """An MJCF or URDF file as one MJCF text, with all that it includes.
+
+    **Raises:** `CaromError` if mujoco is missing, and for files that it cannot read.
+    """
+    mujoco = optional_package("mujoco", "load_mujoco", "mujoco")
+    try:
+        spec = mujoco.MjSpec.from_file(os.fspath(path))
+        spec.compile()
+        return spec.to_xml().encode()
+    except (ValueError, RuntimeError) as error:
+        raise CaromError(f"MuJoCo cannot read the file {path}: {' '.join(str(error).split())}") from None
 
 
 def _is_urdf(source: str | os.PathLike[str]) -> bool:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from carom.checks import is_known, positive, require, require_values
 from carom.contact.impulses import ContactModel
@@ -140,7 +140,7 @@ def simulate(
     max_events: int = MAX_EVENTS,
     project: bool = True,
     force: Float[Array, "*b steps n d"] | None = None,
-    control: Float[Array, "*b steps u"] | Mapping[str, Float[Array, "*b steps"]] | None = None,
+    control: ArrayLike | Mapping[str, ArrayLike] | None = None,
     formulation: Formulation = "lagrangian",
     solver: diffrax.AbstractSolver | None = None,
     compensation_steps: float | Float[Array, ""] | None = COMPENSATION_STEPS,

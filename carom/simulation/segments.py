@@ -308,7 +308,7 @@ class Segments:
         d = free.shape[1]
         dry = jnp.asarray(self.dry)[contacts.active.candidate] & contacts.active.active
         mobility = jnp.diagonal(contacts.delassus)
-        own = jnp.where(dry, mobility[1::d], 0)
+        own = jnp.asarray(jnp.where(dry, mobility[1::d], 0))
         delassus = contacts.delassus + jnp.diag(jnp.zeros_like(mobility).at[::d].set(own))
         pressed = -own * self.loss[contacts.active.candidate] * time
         free = free.at[:, 0].set(jnp.where(dry, pressed, free[:, 0]))

@@ -16,6 +16,7 @@ from carom.contact.boxes import CornerPlane
 from carom.contact.candidates import DiskDisk, DiskPlane, RimPlane
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.constraints import Distance, Joint, Pivot, Tether, Track
+from carom.mechanics.joints import Joints
 from carom.simulation.rollout import Trajectory
 from carom.system import System
 from carom.view.balls import ball_lines, ball_reach, ball_touches
@@ -68,6 +69,9 @@ def lines_of(system: System) -> Lines:
             weights.append([unit[link.i if isinstance(link, Tether) else link.first], 0 * unit[0]])
             anchors.append(np.asarray(link.anchor, float))
             offset.append([zero, anchors[-1]])
+        elif isinstance(link, Joints) and link.kinds and link.kinds != ("free",):
+            weights += _to_joints(link, unit)
+            offset += [[zero, zero]] * (len(weights) - len(offset))
         elif isinstance(link, Pivot | Track):
             weights += _arms(link, unit)
             offset += [[zero, zero]] * (len(weights) - len(offset))
@@ -103,6 +107,15 @@ def lines_of(system: System) -> Lines:
         np.reshape(offset, (-1, 2, dim)),
         np.reshape(anchors, (-1, dim)),
     )
+
+
+def _to_joints(link: Joints, unit: np.ndarray) -> list[list[np.ndarray]]:
+    """From the centre of the body, and of its parent, to where its first joint is at rest."""
+    ends = [(link.i, np.asarray(link.anchors[0], float))]
+    if link.j is not None:
+        ends.append((link.j, np.asarray(link.place, float)))
+    own = [(i, np.concatenate([[1 - place.sum()], place])) for i, place in ends]
+    return [[unit[i], weights @ unit[i : i + len(weights)]] for i, weights in own]
 
 
 def _arms(link: Pivot | Track, unit: np.ndarray) -> list[list[np.ndarray]]:

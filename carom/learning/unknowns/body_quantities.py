@@ -9,6 +9,7 @@ import numpy as np
 from carom.checks import as_floats
 from carom.contact.candidates import DiskDisk, DiskPlane, RimPlane
 from carom.contact.impulses import CMr, Coulomb
+from carom.contact.joint_limits import JointReading
 from carom.learning.unknowns.quantity import AXES, Entry, FirstMass, Label, MassRatio, Path, Place, Quantity, Size, Slot
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.potentials import Gravity, NoPotential, Potential, Springs, Sum
@@ -71,6 +72,8 @@ def property_owners(system: System) -> dict[int, str]:
     """What each contact property belongs to, in words."""
     owners: dict[int, list[str]] = {}
     for contact in system.contacts:
+        if isinstance(contact, JointReading):
+            continue  # limits have no friction, and dry friction is a quantity of its own
         for name, index in zip(contact.names(), contact.property_index, strict=True):
             owners.setdefault(index, []).append(name)
     few = 3
@@ -82,7 +85,7 @@ def property_owners(system: System) -> dict[int, str]:
 
 def model_quantities(system: System) -> Iterator[Quantity]:
     """What fast impacts lose by `Coulomb`, and the epsilon of `CMr`."""
-    model = system.contact_model if system.contacts else None
+    model = system.contact_model if property_owners(system) else None
     if isinstance(model, Coulomb):
         for kind in ("friction_loss", "restitution_loss"):
             label = Label(kind, "", f"all contacts: what fast impacts lose of {kind.removesuffix('_loss')}")

@@ -25,6 +25,7 @@ from carom.learning.unknowns.body_quantities import (
     radius_quantities,
     with_field,
 )
+from carom.learning.unknowns.force_quantities import force_quantities as joint_force_quantities
 from carom.learning.unknowns.geometry_quantities import (
     anchor_quantities,
     limit_quantities,
@@ -41,6 +42,7 @@ FINDERS: tuple[Callable[[System], Iterator[Quantity]], ...] = (
     property_quantities,
     model_quantities,
     force_quantities,
+    joint_force_quantities,
     radius_quantities,
     plane_quantities,
     shape_quantities,

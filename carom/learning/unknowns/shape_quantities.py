@@ -16,6 +16,7 @@ from carom.learning.unknowns.body_quantities import SHARE, length_of, potentials
 from carom.learning.unknowns.quantity import AXES, Entry, Label, Path, Quantity, Shift, Size, Slot
 from carom.mechanics.bodies import RigidBody
 from carom.mechanics.constraints import Distance, Joint, Pivot, Tether, Track
+from carom.mechanics.joints import Joints
 from carom.mechanics.potentials import Springs
 from carom.system import System
 
@@ -184,6 +185,6 @@ def _can_move(system: System, body: int) -> bool:
         for contact in system.contacts
         if any(body in bodies for bodies in contact.bodies_of())
     )
-    tied = any(isinstance(link, Distance | Tether) and points & set(link.points()) for link in system.links)
+    tied = any(isinstance(link, Distance | Tether | Joints) and points & set(link.points()) for link in system.links)
     sprung = any(isinstance(part, Springs) and points & set(part.points) for _, part in potentials(system))
     return shaped and not tied and not sprung
