@@ -25,6 +25,8 @@ NOT_FINITE = 1e300
 
 LARGEST_ERROR = 1e3
 """A relative error beyond this says no more than this does."""
+ROUNDED = 1e-6
+"""A first error that is less than this share of the next is rounding: predictions begin with what was seen."""
 
 
 def trajectory_error(
@@ -48,6 +50,8 @@ def trajectory_error(
         for color, dashes, (name, values) in _styled(curves):
             lower, median, upper = _quartiles(values)
             # On a logarithmic axis an exact start has no place: curves begin at the first error.
+            if len(median) > 1 and median[0] < ROUNDED * median[1]:
+                median[0] = 0
             shown = median > 0
             lost = int(np.sum(np.isinf(values).any(axis=1)))
             label = f"{name} ({lost} of {len(values)} not finite)" if lost else name

@@ -27,6 +27,8 @@ from carom.system import System
 
 FREE, NEAR = 64, 32
 """Windows that are moved together, without and with contact."""
+AT_ONCE = 4
+"""Contacts that are closed at once in nearly all segments: the solver has room for more only where there are more."""
 PLACES = 4
 """Places on the way of a step at which gaps are looked at, before it is said that none can close."""
 INDEPENDENT = 1e-8
@@ -139,7 +141,7 @@ def _segments(
         system, stepper = learned.assemble(theta), _stepper(learned, dt, rule)
         if rule == "step":
             out = step(system, z[0], z[1], stepper)
-            return (jnp.stack([out.x, out.v]), 0 * left), now._replace(left=0 * left)
+            return (jnp.stack([out.x, out.v]), 0 * left), now._replace(left=0 * left, overflow=out.overflow)
         inverse_mass = system.inverse_mass_matrix()
         forward = Segments(system, inverse_mass, stepper, smooth_flow(system, stepper, inverse_mass))
         end = forward(now._replace(x=z[0], v=z[1], left=left), count)
@@ -206,8 +208,10 @@ def _padded(rows: np.ndarray, size: int) -> np.ndarray:
 class _Within:
     """Windows within a step, and the derivatives of how far they are by where they began it and by theta."""
 
-    def __init__(self, system: System, z: Float[np.ndarray, "W 2 n d"], P: int):
+    def __init__(self, learned: Learned, z: Float[np.ndarray, "W 2 n d"], P: int):
+        system = learned.skeleton
         count, size, n = len(z), z[0].size, system.n_points
+        self.all, self.few = learned, learned.with_max_active(min(AT_ONCE, system.max_active))
         self.state, self.left = np.zeros_like(z), np.zeros(count)
         self.acted, self.push = np.zeros((count, system.n_candidates), bool), np.zeros((count, n))
         self.segments = np.zeros(count, int)
@@ -220,8 +224,21 @@ class _Within:
         size = self.slopes.shape[1] - 1
         self.slopes[rows[:, None], np.arange(size), np.arange(size)] = 1
 
-    def move_on(self, learned: Learned, theta, rows, state, dt, rule: ImpactRule, thin: bool) -> Int[np.ndarray, " D"]:
+    def move_on(self, theta, rows, state, dt, rule: ImpactRule, thin: bool) -> Int[np.ndarray, " D"]:
         """Go on by a segment; which windows are at the end of their step."""
+        end, own = self._segment(self.few, theta, rows, state, dt, rule, thin)
+        over = np.flatnonzero(end.overflow > 0)
+        if len(over) and self.all.skeleton.max_active > AT_ONCE:
+            again = self._segment(self.all, theta, rows[over], state, dt[over], rule, thin)
+            for part, full in zip(jax.tree.leaves((end, own)), jax.tree.leaves(again), strict=True):
+                part[over] = full
+        self.state[rows], self.left[rows] = np.stack([end.x, end.v], 1), end.left
+        self.acted[rows], self.push[rows] = end.acted, end.push
+        self.segments[rows] += 1
+        self.slopes[rows] = _composed(own, self.slopes[rows])
+        return rows[~(end.left > 0)]
+
+    def _segment(self, learned: Learned, theta, rows, state, dt, rule: ImpactRule, thin: bool):
         padded = _padded(rows, NEAR)
         x, v, left, acted, push, count, start = (
             jnp.asarray(part[padded])
@@ -230,12 +247,7 @@ class _Within:
         none = jnp.zeros(len(padded))
         now = Progress(x, v, left, acted, none > 0, none.astype(int), none, push)
         out = _compiled_segments()(learned, theta, start, jnp.asarray(_padded(dt, NEAR)), now, count, rule, thin)
-        end, own = jax.tree.map(lambda a: np.asarray(a)[: len(rows)], out)
-        self.state[rows], self.left[rows] = np.stack([end.x, end.v], 1), end.left
-        self.acted[rows], self.push[rows] = end.acted, end.push
-        self.segments[rows] += 1
-        self.slopes[rows] = _composed(own, self.slopes[rows])
-        return rows[~(end.left > 0)]
+        return jax.tree.map(lambda a: np.array(a)[: len(rows)], out)
 
 
 class Flow:
@@ -260,9 +272,9 @@ class Flow:
             state = _starts(self.learned, there, state)[0]
         _free_steps(self.learned, there, state, jnp.full(FREE, dt), rule, thin)
         if self.learned.skeleton.contacts:
-            within, rows = _Within(self.learned.skeleton, np.asarray(state[:NEAR]), len(theta)), np.arange(NEAR)
+            within, rows = _Within(self.learned, np.asarray(state[:NEAR]), len(theta)), np.arange(NEAR)
             within.begin(rows, np.asarray(state[:NEAR]), np.full(NEAR, dt))
-            within.move_on(self.learned, there, rows, np.asarray(state[:NEAR]), np.full(NEAR, dt), rule, thin)
+            within.move_on(there, rows, np.asarray(state[:NEAR]), np.full(NEAR, dt), rule, thin)
 
     def _is_thin(self, theta: Array, z: Float[np.ndarray, "W 2 n d"]) -> bool:
         """Whether states may be moved along their constraints alone: these are independent, and the same for all theta.
@@ -305,7 +317,7 @@ class Flow:
         closed = np.zeros((count, self.learned.skeleton.n_candidates), bool)
         alone = np.zeros((count, half))
         hits: list[tuple] = []
-        within = _Within(self.learned.skeleton, z, P)
+        within = _Within(self.learned, z, P)
 
         def commit(rows, new, by_start_and_theta):
             state[rows], slopes[rows] = new, by_start_and_theta
@@ -336,7 +348,7 @@ class Flow:
             if len(queue) < NEAR and np.any((at < length) & ~waiting):
                 continue
             for rows in _batches(queue, NEAR):
-                done = within.move_on(self.learned, there, rows, state, steps[rows, at[rows]], self.rule, thin)
+                done = within.move_on(there, rows, state, steps[rows, at[rows]], self.rule, thin)
                 rows, new, own = done, within.state[done], within.slopes[done][:, :-1]
                 jump = np.linalg.norm(new[:, 1].reshape(-1, half) - alone[rows], axis=1)
                 hit = jump > 1e-9 * np.linalg.norm(alone[rows], axis=1)

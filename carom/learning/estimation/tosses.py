@@ -188,6 +188,8 @@ def choose_segments(
     return chosen[np.sort(rng.permutation(len(chosen))[:count])]
 
 
+BOUNCY = ("restitution", "restitution_loss")
+"""Quantities that begin once at 0.5 too: segments may end in two places, one without a rebound."""
 TOLD = 0.5
 """A standard error of a larger share of a change that matters does not tell a quantity."""
 DAMPING = 1e-2
@@ -274,25 +276,44 @@ def learn_tosses(
     known = [] if run is None else run.metrics()
     started = time.monotonic() - (known[-1]["seconds"] if known else 0.0)
     errors, count = np.full(len(theta), np.nan), 0
-    done = {row["horizon"]: row for row in known if "horizon" in row}
+    stages = [(horizon, False) for horizon in config.horizons]
+    begins = np.array(theta)
+    bouncy = [k for k, q in enumerate(learned.quantities) if q.label.kind in BOUNCY]
+    if config.evaluations and bouncy:
+        stages.append((config.horizons[-1], True))
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    done = {(row["horizon"], row.get("bouncy", False)): row for row in known if "horizon" in row}
 
     def log(**row: Any) -> None:
         if run is not None:
             run.log({"epoch": 0, "seconds": round(time.monotonic() - started, 3), **row})
 
-    total = len(config.horizons) + config.evaluations
+    total = len(stages) + config.evaluations
     with LoopProgress("step", total, shown=progress) as shown:
-        for number, horizon in enumerate(config.horizons, 1):
-            if horizon in done:
-                row = done[horizon]
+        for number, (horizon, again) in enumerate(stages, 1):
+            if (horizon, again) in done:
+                row = done[horizon, again]
                 theta, errors, count = np.array(row["theta"]), np.array(row["errors"], float), row["segments"]
-                continue
-            theta, errors, count = _stage(learned, theta, recording, horizon, config, seed)
-            log(horizon=horizon, theta=theta.tolist(), errors=errors.tolist(), segments=count)
-            shown.update(number, f"segments of {horizon}: " + _named(learned, theta))
+            else:
+                if again:
+                    theta = np.array(begins)
+                    theta[bouncy] = 0.5
+                theta, errors, count = _stage(learned, theta, recording, horizon, config, seed)
+                log(horizon=horizon, bouncy=again, theta=theta.tolist(), errors=errors.tolist(), segments=count)
+                shown.update(number, f"segments of {horizon}: " + _named(learned, theta))
+            if number == len(config.horizons) - 1:
+                begins = np.array(theta)
+            if horizon == config.horizons[-1]:
+                found.append((theta, errors))
         before = [row for row in known if "loss" in row]
         some = np.random.default_rng((seed, 3)).permutation(recording.n_trajectories)[: config.toss_count]
-        theta, made = _search(learned, theta, recording.select(np.sort(some)), config, before, log, shown)
+        of_stages = [theta for theta, _ in found]
+        made = 0
+        if config.evaluations:
+            theta, made, best = _search(
+                learned, of_stages, recording.select(np.sort(some)), config, before, log, shown, len(stages)
+            )
+            errors = found[best][1]
     position, rotation = _whole(learned, theta, recording, config)
     system, seconds = learned.assemble(jnp.asarray(theta)), time.monotonic() - started
     lower, upper = np.asarray(learned.lower), np.asarray(learned.upper)
@@ -325,18 +346,19 @@ def _whole(learned: Learned, theta, recording: Recording, config: TossConfig):
     return position / (2 * float(jnp.min(box_of(learned.assemble(jnp.asarray(theta))).half_widths))), rotation
 
 
-def _search(learned: Learned, theta, recording, config: TossConfig, before: list[dict[str, Any]], log, shown):
-    """Nelder and Mead's search over whole tosses, which repeats what `before` holds without computing it again."""
-    if config.evaluations == 0:
-        return theta, 0
-    scale, count = search_steps(learned), len(theta)
-    known = {tuple(row["theta"]): row["loss"] for row in before}
-    base = np.asarray(learned.project(jnp.asarray(theta)))
-    made, best = 0, (np.inf, base)
+def _search(learned: Learned, starts, recording, config: TossConfig, before: list[dict[str, Any]], log, shown, stages):
+    """Nelder and Mead's search over whole tosses, from the best of several starts.
 
-    def loss(z) -> float:
+    It repeats what `before` holds without computing it again. Returns the best free numbers, how often tosses were
+    predicted, and which start it was.
+    """
+    scale, count = search_steps(learned), len(learned.names)
+    known = {tuple(row["theta"]): row["loss"] for row in before}
+    made, best = 0, (np.inf, np.asarray(starts[0]))
+
+    def loss_at(theta) -> float:
         nonlocal made, best
-        tried = np.asarray(learned.project(jnp.asarray(base + scale * z)))
+        tried = np.asarray(learned.project(jnp.asarray(theta)))
         made += 1
         key = tuple(tried.tolist())
         if key not in known:
@@ -346,13 +368,16 @@ def _search(learned: Learned, theta, recording, config: TossConfig, before: list
             log(theta=tried.tolist(), loss=known[key])
         if known[key] < best[0]:
             best = known[key], tried
-        shown.update(len(config.horizons) + made, f"whole tosses {best[0]:.4f}: " + _named(learned, best[1]))
+        shown.update(stages + made, f"whole tosses {best[0]:.4f}: " + _named(learned, best[1]))
         return known[key]
 
+    first = int(np.argmin([loss_at(theta) for theta in starts]))
+    base = best[1]
     simplex = np.concatenate([np.zeros((1, count)), 0.5 * np.eye(count)])
-    options = {"maxfev": config.evaluations, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}
-    scipy.optimize.minimize(loss, np.zeros(count), method="Nelder-Mead", options=options)
-    return best[1], made
+    most = max(config.evaluations - made, 1)
+    options = {"maxfev": most, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}
+    scipy.optimize.minimize(lambda z: loss_at(base + scale * z), np.zeros(count), method="Nelder-Mead", options=options)
+    return best[1], made, first
 
 
 def _named(learned: Learned, theta) -> str:

@@ -129,6 +129,10 @@ class Learned(eqx.Module):
 
         return Learned(self.skeleton, tuple(tuple(map(scaled, group)) for group in self.groups), self.names)
 
+    def with_max_active(self, max_active: int) -> "Learned":
+        """With room for so many closed contacts; see `System`."""
+        return Learned(self.skeleton.with_max_active(max_active), self.groups, self.names)
+
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """The first of each group."""
