@@ -11,6 +11,7 @@ import pytest
 from systems import refused
 
 import carom
+from carom.cli.systems import choose
 from carom.mjcf.bodies import groups_of, joints_of, placed, state_of
 
 mujoco = pytest.importorskip("mujoco")
@@ -234,7 +235,7 @@ def test_what_is_not_turned_has_derivatives():
       <geom pos="0 0 .2" contype="0" conaffinity="0"/></body>"""
     world = f"<worldbody>{body}</worldbody>"
     system = carom.load_mujoco(f"<mujoco><default><geom size='.1'/></default>{world}</mujoco>").system
-    x, v = system.state_from_joints(np.zeros(3), [0.1, 0.2, 0.3])
+    x, _ = system.state_from_joints(np.zeros(3), [0.1, 0.2, 0.3])
     np.testing.assert_allclose(system.gaps(x), np.deg2rad(40))
     turned, _ = system.state_from_joints([0.3, 0.0, 0.4])
     np.testing.assert_allclose(system.gaps(turned), np.deg2rad(40) - 0.5, atol=ROUNDING)
@@ -254,3 +255,16 @@ def test_dry_friction_needs_coulombs_law():
     system = carom.load_mujoco(HINGE.format(0, 'frictionloss="0.5"')).system
     with refused('DryFriction needs the contact model "coulomb"'):
         system.with_contact_model("cm")
+
+
+def test_a_robot_file_is_a_system_of_the_command_line(tmp_path):
+    """Its start and time step are its own; the copy that a run folder keeps is one file and the same system."""
+    for name, text in (("hinge.xml", HINGE.format(-9.81, 'damping="0.5"')), ("copy.xml", None)):
+        path = tmp_path / name
+        path.write_bytes(chosen.source if text is None else text.encode())
+        before, chosen = None if text else chosen, choose(str(path))
+        assert (chosen.own, chosen.stem, chosen.truth, chosen.start.dt) == (True, path.stem, None, 0.01)
+    np.testing.assert_array_equal(before.start.x, chosen.start.x)
+    np.testing.assert_array_equal(before.system.forces[0].viscous, chosen.system.forces[0].viscous)
+    with refused("task is the file 'gone.urdf', which does not exist."):
+        choose("gone.urdf")

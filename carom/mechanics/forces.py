@@ -16,6 +16,8 @@ from jaxtyping import Array, ArrayLike, Float
 from carom.checks import as_floats, not_negative, require, require_values, whole
 from carom.mechanics.constraints import place_weights
 
+Numbers = ArrayLike | Sequence[float]
+
 
 class Coordinates(NamedTuple):
     """Coordinates of all joints of a system, and their rates: rad and rad/s, m and m/s."""
@@ -63,10 +65,10 @@ class JointSpring(Force):
     def __init__(
         self,
         stiffness,
-        rest: ArrayLike = 0.0,
-        deadband: ArrayLike = 0.0,
-        quadratic: ArrayLike = 0.0,
-        cubic: ArrayLike = 0.0,
+        rest: Numbers = 0.0,
+        deadband: Numbers = 0.0,
+        quadratic: Numbers = 0.0,
+        cubic: Numbers = 0.0,
         gears=None,
     ):
         self.stiffness, self.rest, self.deadband = as_floats(stiffness), as_floats(rest), as_floats(deadband)
@@ -94,7 +96,7 @@ class JointDamping(Force):
     cubic: Float[Array, "..."]
     gears: Float[Array, "s q"] | None
 
-    def __init__(self, viscous, quadratic: ArrayLike = 0.0, cubic: ArrayLike = 0.0, gears=None):
+    def __init__(self, viscous, quadratic: Numbers = 0.0, cubic: Numbers = 0.0, gears=None):
         self.viscous, self.quadratic, self.cubic = as_floats(viscous), as_floats(quadratic), as_floats(cubic)
         self.gears = None if gears is None else as_floats(gears)
         for name, value in (("viscous", viscous), ("quadratic", quadratic), ("cubic", cubic)):
@@ -145,13 +147,13 @@ class Actuators(Force):
     def __init__(
         self,
         gears,
-        gain: ArrayLike = 1.0,
-        bias: ArrayLike = 0.0,
+        gain: Numbers = 1.0,
+        bias: Numbers = 0.0,
         control_range=None,
         force_range=None,
         activation_range=None,
         dynamics: Sequence[Dynamics] | None = None,
-        time_constant: ArrayLike = 1.0,
+        time_constant: Numbers = 1.0,
         names: Sequence[str] | None = None,
         torque_range=None,
     ):

@@ -291,7 +291,7 @@ class Segments:
         rest = jax.lax.cond(
             first,
             lambda: (new.x, new.v, new.contact),
-            lambda: (*self.after_impact(new, contacts, hit_jump, kick, acting.velocity), jnp.any(active)),
+            lambda: (*self.after_impact(new, contacts, hit_jump, kick, acting.velocity), jnp.any(active & ~dry)),
         )
         return new._replace(x=rest[0], v=rest[1], contact=rest[2]), wanted
 
