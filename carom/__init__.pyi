@@ -70,6 +70,7 @@ from .mechanics.potentials import Springs as Springs
 from .mechanics.potentials import Sum as Sum
 from .mjcf.load import MujocoModel as MujocoModel
 from .mjcf.load import load_mujoco as load_mujoco
+from .mjcf.write import save_mujoco as save_mujoco
 from .recordings.files import load_recording as load_recording
 from .recordings.files import save_recording as save_recording
 from .recordings.observations import Observations as Observations

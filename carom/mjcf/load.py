@@ -75,7 +75,7 @@ def load_mujoco(
     touching = touching_pairs(mujoco, model)
     if "mocap" in ignored:
         touching = fix_mocap(model, touching)
-    urdf = _is_urdf(source)
+    urdf = is_urdf(source)
     refuse([*refusals(mujoco, model), *contact_refusals(model, touching, urdf=urdf)], ignored)
     free = "joint of type floating" if urdf else "freejoint"
     require(model.nv > 0, f"the model has no joints: nothing in it moves. Give a body a {free}, for one.")
@@ -165,7 +165,7 @@ def whole_xml(path: str | os.PathLike[str]) -> bytes:
         raise CaromError(f"MuJoCo cannot read the file {path}: {' '.join(str(error).split())}") from None
 
 
-def _is_urdf(source: str | os.PathLike[str]) -> bool:
+def is_urdf(source: str | os.PathLike[str]) -> bool:
     """Whether the first element is a URDF's; MuJoCo has read it before."""
     text = os.fspath(source)
     content = text if "<" in text else Path(text).read_text(errors="replace")
