@@ -24,7 +24,16 @@ from carom.mechanics.bodies import (
 )
 from carom.mechanics.constraints import Constraint, Rigid
 from carom.mechanics.dynamics import lagrangian_field
-from carom.mechanics.forces import Actuators, Coordinates, Force, JointDamping, JointSpring, Rotors, signal_of
+from carom.mechanics.forces import (
+    Actuators,
+    Coordinates,
+    Force,
+    JointDamping,
+    JointSpring,
+    PointDrag,
+    Rotors,
+    signal_of,
+)
 from carom.mechanics.joints import Joints
 from carom.mechanics.potentials import NoPotential, Potential
 
@@ -131,6 +140,17 @@ class System(eqx.Module):
                 f"(0 to {table.n_points - 1}).",
             )
         self.forces, self.rotors = tuple(forces), self._rotors(rotors)
+        firsts = [p for p, body in zip(table.center, self.bodies, strict=True) if isinstance(body, RigidBody)]
+        for part in (*self.joints, *self.forces):
+            for p in (getattr(part, name, None) for name in ("i", "j", "first")):
+                require(
+                    p is None or p in firsts,
+                    f"{type(part).__name__} names the point {p}, which is no rigid body's first: those are {firsts}.",
+                )
+            far = [p for p in getattr(part, "points", ()) if p >= table.n_points] if isinstance(part, PointDrag) else []
+            require(not far, f"PointDrag names the points {far}, but the system has {table.n_points}.")
+        held = [joint.i for joint in self.joints]
+        require(len(set(held)) == len(held), "a body has two Joints: give all its joints in one.")
         motors = [force for force in self.forces if isinstance(force, Actuators)]
         require(len(motors) <= 1, f"forces may hold one Actuators object; they held {len(motors)}. Join them.")
         for motor in motors:
@@ -140,7 +160,7 @@ class System(eqx.Module):
                 f"{motor.gears.shape[1]}.",
             )
         for force in self.forces:
-            for name in ("stiffness", "rest", "viscous", "quadratic", "cubic"):
+            for name in ("stiffness", "rest", "deadband", "viscous", "quadratic", "cubic"):
                 size = np.shape(getattr(force, name, 0.0))
                 own = getattr(force, "gears", None)
                 count = self.n_coordinates if own is None else own.shape[0]

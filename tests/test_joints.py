@@ -268,3 +268,35 @@ def test_a_robot_file_is_a_system_of_the_command_line(tmp_path):
     np.testing.assert_array_equal(before.system.forces[0].viscous, chosen.system.forces[0].viscous)
     with refused("task is the file 'gone.urdf', which does not exist."):
         choose("gone.urdf")
+
+
+def test_a_slide_may_follow_a_ball():
+    xml = """<mujoco><worldbody><body><joint name="b" type="ball" damping=".2"/>
+      <joint name="s" type="slide" axis="1 0 0" damping="1"/><geom size=".1" pos="0 0 .2"/></body></worldbody>
+      </mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    state, system = Random(model, 0), carom.load_mujoco(xml).system
+    np.testing.assert_allclose(system.joint_velocities(state.x, state.v), state.qvel, atol=10 * ROUNDING)
+
+
+@pytest.mark.parametrize("ratio", [2.0, -0.5, 1.0])
+def test_gears_hold_over_turns(ratio):
+    def wheel(i):
+        return carom.Joints(i, None, ("hinge",), [[0.0, 0.0, 1.0]], np.zeros((1, 3)), np.array([float(i), 0.0, 0.0]))
+
+    wheels = [wheel(0), wheel(4)]
+    gear = carom.Coupling(wheels, [1.0, 0.0], [0.0, 1.0], [0.1, ratio])
+    body = carom.RigidBody(1.0, jnp.ones(3))
+    system = carom.System([body, body], [*wheels, gear])
+    angles = np.linspace(-9, 9, 37)
+    x, _ = system.state_from_joints(np.stack([0.1 + ratio * angles, angles], axis=1))
+    np.testing.assert_allclose(jax.vmap(gear)(x), 0, atol=ROUNDING)
+
+
+def test_a_force_names_the_first_point_of_a_body():
+    bodies = [carom.RigidBody(1.0, jnp.ones(3))] * 2
+    with refused("BodyDrag names the point 1, which is no rigid body's first: those are [0, 4]."):
+        carom.System(bodies, forces=[carom.BodyDrag(1, 1.0)])
+    with refused("a body has two Joints: give all its joints in one."):
+        held = carom.Joints(0, None, (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(3))
+        carom.System(bodies, [held, held])

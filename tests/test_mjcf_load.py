@@ -369,7 +369,7 @@ REFUSED = {
     ),
     "stiffness": (
         world('<body name="ball"><joint name="j" type="free" stiffness="1"/><geom size=".1"/></body>'),
-        "stiffness (joint 'j'; of a free joint, of a ball that is slack elsewhere, or one that yields: set it to 0)",
+        "stiffness (joint 'j'; of a free joint, of a ball that is slack elsewhere or not linear, or one that yields:",
     ),
     "mocap": (arm(before='<body name="hand" mocap="true"/>'), "mocap (body 'hand'; set mocap=\"false\")"),
     "fluid": (

@@ -86,3 +86,23 @@ def test_what_has_no_place_is_told_and_nothing_is_written(tmp_path):
     with refused("has no element of its own called"):
         carom.save_mujoco(other, out, source=source)
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('<motor name="lift" joint="shoulder" gear="3 0 0 0 0 0"/>', '<position name="lift" joint="shoulder" kp="3"/>'),
+        ("<worldbody>", '<default><motor gear="100"/></default><worldbody>'),
+    ],
+)
+def test_what_would_be_read_as_another_system_is_not_written(tmp_path, before, after):
+    """A servo's gain is its stiffness too; a gear of a class is not that of the element."""
+    source, out = tmp_path / "arm.xml", tmp_path / "learned.xml"
+    text = ARM.format(angle="radian", low=-0.5, high=1.0, rest=0.3).replace(before, after)
+    source.write_text(text.replace(' gear="3 0 0 0 0 0"', "") if "default" in after else text)
+    system = carom.load_mujoco(source).system
+    spring, damping, motors = system.forces
+    motors = eqx.tree_at(lambda f: f.gain, motors, motors.gain.at[:, 0].multiply(1.1))
+    with refused("cannot be written into"):
+        carom.save_mujoco(eqx.tree_at(lambda s: s.forces, system, (spring, damping, motors)), out, source=source)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["arm.xml"]

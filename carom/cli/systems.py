@@ -116,8 +116,10 @@ def choose(name: str) -> Chosen:
 
 def _robot(name: str, path: Path) -> Chosen:
     require(path.is_file(), f"task is the file {name!r}, which does not exist.")
-    loaded = load_mujoco(path)
-    return Chosen(name, loaded.system, whole_xml(path), start=Start(loaded.x0, loaded.v0, loaded.dt))
+    # What a run folder keeps is read again from this text, which has fewer digits than the file may have.
+    source = whole_xml(path)
+    loaded = load_mujoco(source.decode())
+    return Chosen(name, loaded.system, source, start=Start(loaded.x0, loaded.v0, loaded.dt))
 
 
 def data_and_system(path: Path, name: str) -> tuple[Recording, Chosen | None, str]:

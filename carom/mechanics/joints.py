@@ -11,6 +11,7 @@ of the points in closed form: their rates, and the forces that torques on them a
 """
 
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -150,8 +151,9 @@ class Joints(Constraint):
             return rates
         (turn, _), (change, _) = jax.jvp(self._relative, (x,), (v,))
         spin = self.frame @ _vector(turn.T @ change)
-        last = self.count - 3
-        return jnp.asarray(jnp.where(np.arange(self.count) < last, rates, jnp.pad(spin, (last, 0))))
+        free = self.kinds == ("free",)
+        first = self.dim if free else sum(self.sizes[: self.kinds.index("ball")])
+        return jnp.concatenate([rates[:first], spin, rates[first + 3 :]])
 
     def pose(
         self, q: Float[Array, " q"], turn: Float[Array, "d d"], place: Float[Array, " d"], change: Float[Array, " q"]
@@ -318,6 +320,9 @@ class Coupling(Constraint):
 
     **Arguments:** `joints`, as they stand in the system's constraints; `first`, `second` (q,) over their coordinates,
     one after the other; `coefficients` (c,); `zeros` (2,).
+
+    Angles are known up to full turns. A linear coupling of two hinges whose ratio is a simple fraction, a gear, holds
+    over turns; others hold within half a turn of where the joints are at rest.
     """
 
     joints: tuple[Joints, ...]
@@ -325,6 +330,7 @@ class Coupling(Constraint):
     second: Float[Array, " q"]
     coefficients: Float[Array, " c"]
     zeros: Float[Array, " 2"]
+    period: float | None = eqx.field(static=True)
 
     def __init__(self, joints: Sequence[Joints], first, second, coefficients, zeros=(0.0, 0.0)):
         self.joints = tuple(joints)
@@ -335,6 +341,19 @@ class Coupling(Constraint):
                 value.shape == (count,),
                 f"Coupling {name} must be {count} numbers, one a coordinate; its shape was {value.shape}.",
             )
+        self.period = self._period()
+
+    def _period(self) -> float | None:
+        """What the equation is known up to, as angles are known up to full turns: of gears, whose ratio is rational."""
+        hinges = np.array([is_hinge for joint in self.joints for is_hinge in joint.is_hinge()], bool)
+        rows = np.stack([np.asarray(self.first), np.asarray(self.second)])
+        unit = np.isin(rows, (0.0, 1.0)).all() and (rows.sum(axis=1) <= 1).all() and not rows[:, ~hinges].any()
+        linear = np.asarray(self.coefficients, float)
+        if not unit or np.any(linear[2:] != 0):
+            return None
+        ratio = float(linear[1]) if len(linear) > 1 and rows[1].any() else 0.0
+        near = Fraction(ratio).limit_denominator(64)
+        return 2 * np.pi / near.denominator if abs(float(near) - ratio) < 1e-9 else None
 
     @classmethod
     def of(cls, joints: Sequence[Joints], first, second, coefficients, zeros=(0.0, 0.0)) -> "Coupling":
@@ -348,7 +367,10 @@ class Coupling(Constraint):
     def __call__(self, x):
         q = jnp.concatenate([joint.coordinates(x) for joint in self.joints])
         s = self.second @ q - self.zeros[1]
-        return (self.first @ q - self.zeros[0] - jnp.polyval(self.coefficients[::-1], s))[None]
+        off = self.first @ q - self.zeros[0] - jnp.polyval(self.coefficients[::-1], s)
+        if self.period is not None:
+            off = off - jax.lax.stop_gradient(self.period * jnp.round(off / self.period))
+        return off[None]
 
     def points(self):
         return tuple(dict.fromkeys(p for joint in self.joints for p in joint.points()))

@@ -160,6 +160,8 @@ def whole_xml(path: str | os.PathLike[str]) -> bytes:
     try:
         spec = mujoco.MjSpec.from_file(os.fspath(path))
         spec.compile()
+        folder = Path(path).resolve().parent
+        spec.meshdir, spec.texturedir = (str(folder / (own or "")) for own in (spec.meshdir, spec.texturedir))
         return spec.to_xml().encode()
     except (ValueError, RuntimeError) as error:
         raise CaromError(f"MuJoCo cannot read the file {path}: {' '.join(str(error).split())}") from None

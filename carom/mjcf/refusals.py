@@ -96,7 +96,8 @@ def _springs(mujoco: Any, model: Any) -> np.ndarray:
         k == BALL_JOINT and not np.array_equal(model.qpos_spring[a : a + 4], model.qpos0[a : a + 4])
         for k, a in zip(kind, start, strict=True)
     ]
-    return there & ((kind == FREE_JOINT) | np.array(moved, bool) | (np.asarray(model.jnt_springyield) != 0))
+    curved = (kind == BALL_JOINT) & _nonzero(model.jnt_stiffnesspoly)
+    return there & ((kind == FREE_JOINT) | curved | np.array(moved, bool) | (np.asarray(model.jnt_springyield) != 0))
 
 
 FREE_JOINT, BALL_JOINT = 0, 1
@@ -113,7 +114,7 @@ RULES: dict[str, Callable[[Any, Any], Refused]] = {
     "stiffness": _of(
         "stiffness",
         "joint",
-        "of a free joint, of a ball that is slack elsewhere, or one that yields: set it to 0",
+        "of a free joint, of a ball that is slack elsewhere or not linear, or one that yields: set it to 0",
         lambda m: _springs(None, m),
     ),
     "mocap": _of("mocap", "body", 'set mocap="false"', lambda m: np.asarray(m.body_mocapid) >= 0),

@@ -58,7 +58,46 @@ def save_mujoco(
     changes = _changes(told, system, _angles_in(tree, urdf), urdf)
     for change in changes:
         _apply(tree, change, origin, urdf)
-    write_whole(Path(path), _written(text, tree).encode())
+    new = _written(text, tree)
+    _check(new, system, origin, options)
+    write_whole(Path(path), new.encode())
+
+
+def _check(text: str, system: System, origin: Path, options: dict[str, Any]) -> None:
+    """Read what is to be written, beside the file that it came from, as that may include others.
+
+    **Raises:** `CaromError` if it is another system: a default class or a tendon has a part in a number, say.
+    """
+    probe = origin.with_name(f".{origin.stem}-carom{origin.suffix}")
+    try:
+        write_whole(probe, text.encode())
+        again = load_mujoco(probe, **options).system
+    finally:
+        probe.unlink(missing_ok=True)
+    off = [
+        jax.tree_util.keystr(where).lstrip(".")
+        for (where, a), b in zip(
+            jax.tree_util.tree_leaves_with_path(_as_laws(again)), jax.tree.leaves(_as_laws(system)), strict=True
+        )
+        if not jax.tree_util.keystr(where).endswith(".near") and not np.allclose(a, b, rtol=1e-9, atol=1e-12)
+    ]
+    require(
+        not off,
+        f"{', '.join(off[:3])} cannot be written into {origin} by the elements' own attributes: a default class, a "
+        "tendon, a servo's two gains or an included file has a part in them. Write these out in the elements first.",
+    )
+
+
+def _as_laws(system: System) -> System:
+    """With the gains of actuators times their gears, as a gain may be written into a gear."""
+    forces = []
+    for force in system.forces:
+        if isinstance(force, Actuators):
+            size = jax.numpy.max(jax.numpy.abs(force.gears), axis=1, keepdims=True)
+            where = (force.gears / size, force.gain * size, force.bias * size)
+            force = eqx.tree_at(lambda f: (f.gears, f.gain, f.bias), force, where)
+        forces.append(force)
+    return eqx.tree_at(lambda s: s.forces, system, tuple(forces))
 
 
 def _parsed(text: str) -> ElementTree.Element:
@@ -81,7 +120,12 @@ def _angles_in(tree: ElementTree.Element, urdf: bool) -> float:
 
 
 def _number(value: float) -> Callable[[str | None], str]:
-    return lambda _: f"{value:.12g}"
+    """The number in place of the first, as others may follow: a polynomial's."""
+
+    def text(old: str | None) -> str:
+        return " ".join([f"{value:.12g}", *([] if old is None else old.split()[1:])])
+
+    return text
 
 
 def _changes(told: System, new: System, degrees: float, urdf: bool) -> list[_Change]:
@@ -115,7 +159,7 @@ def _changes(told: System, new: System, degrees: float, urdf: bool) -> list[_Cha
             for k in np.flatnonzero(np.asarray(old.gain[:, 0]) != np.asarray(force.gain[:, 0])):
                 ratio = float(force.gain[k, 0]) / float(old.gain[k, 0])
                 found.append(_Change(tuple(GAINS), old.names[k], "gain", _scaled(ratio)))
-            force = eqx.tree_at(lambda f: f.gain, force, old.gain)
+            force = eqx.tree_at(lambda f: f.gain, force, force.gain.at[:, 0].set(old.gain[:, 0]))
         forces.append(force)
     rest = eqx.tree_at(lambda s: s.forces, new, tuple(forces))
     if told.rotors is not None and new.rotors is not None:

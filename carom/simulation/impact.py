@@ -14,7 +14,7 @@ from carom.checks import positive, require, require_values
 from carom.contact.energy import dissipative
 from carom.contact.impulses import ContactState, Jump, consistent_velocity, target_velocity
 from carom.mechanics.dynamics import FIELDS, Formulation, saddle_point
-from carom.mechanics.forces import Signal
+from carom.mechanics.forces import Signal, signal_of
 from carom.simulation.integrators import RK4, flow
 from carom.simulation.projection import project_state
 from carom.system import System
@@ -84,6 +84,10 @@ def smooth_flow(
     the time (s) since the step began, which only what `signal` drives hangs on.
     """
     field = FIELDS[stepper.formulation]
+    motors = system.actuators
+    if signal is None and motors is not None:
+        none = jnp.zeros(motors.count, inverse_mass.dtype)
+        signal = signal_of(motors, none, none)
 
     def rate(state, pressing=None, since=0.0):
         x, v = state
@@ -157,6 +161,8 @@ def closed_contacts(
     v_star = jnp.zeros_like(velocity)
     if stepper.compensation_steps is not None and system.compensation == "paper":
         joints = jnp.zeros((0, *x.shape), x.dtype) if saddle is None else saddle.jacobian
+        if system.rotors is not None:
+            joints = joints[: -system.rotors.inertia.shape[0]]  # they turn
         depth = jnp.where(active.active, jnp.maximum(-active.gap, 0), 0)
         v_star = target_velocity(active.jacobian, depth, joints, time=stepper.dt * compensation_steps_of(stepper))
     return ContactState(

@@ -65,6 +65,7 @@ def step(
     """
     if system.step_model is not None:
         require(force is None, "force must be None for a system with a step_model: it has no forces.")
+        require(signal is None, "control must be None for a system with a step_model: it has no forces.")
         x, v = system.step_model(system, x, v, stepper.dt)
         closed = jnp.any(system.gaps(x) < 0)
         return StepResult(x, v, closed, overflow=jnp.asarray(0), residual=jnp.zeros((), x.dtype))
@@ -229,6 +230,8 @@ def controls(system: System, control, batch: tuple[int, ...], steps: int, dtype)
     **Raises:** `CaromError` for names and shapes that do not fit, and numbers that are not finite.
     """
     motors = system.actuators
+    if control is None and system.step_model is not None:
+        return None
     if motors is None:
         require(control is None, "control must be None for a system without actuators.")
         return None

@@ -303,7 +303,7 @@ def learn_tosses(
                 shown.update(number, f"segments of {horizon}: " + _named(learned, theta))
             if number == len(config.horizons) - 1:
                 begins = np.array(theta)
-            if horizon == config.horizons[-1]:
+            if number >= len(config.horizons):
                 found.append((theta, errors))
         before = [row for row in known if "loss" in row]
         some = np.random.default_rng((seed, 3)).permutation(recording.n_trajectories)[: config.toss_count]
@@ -373,6 +373,9 @@ def _search(learned: Learned, starts, recording, config: TossConfig, before: lis
 
     first = int(np.argmin([loss_at(theta) for theta in starts]))
     base = best[1]
+    for tried, value in known.items():  # of a run that was stopped: nothing that was found is lost
+        if value < best[0]:
+            best = value, np.array(tried)
     simplex = np.concatenate([np.zeros((1, count)), 0.5 * np.eye(count)])
     most = max(config.evaluations - made, 1)
     options = {"maxfev": most, "initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-4, "adaptive": True}

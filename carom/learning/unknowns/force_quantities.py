@@ -164,7 +164,7 @@ def _of_contacts(system: System) -> Iterator[Quantity]:
 def _room(contact: JointLimit, c: int) -> tuple[float, float]:
     """Between what a limit may be: on its side of the middle, where there is another one on the other side."""
     bounds, gears = (np.asarray(part, float) for part in (contact.bounds, contact.gears))
-    if contact.ball:
+    if contact.ball is not None:
         return 0.0, max(np.pi, bounds[c])
     side = contact.sides[c]
     for other, own in enumerate(contact.sides):
