@@ -189,7 +189,7 @@ class Joints(Constraint):
             return jnp.zeros(0, x.dtype)
         turn, place = self._relative(x)
         moved = self.rotation.T @ turn
-        angles = self._angles(moved) if self._needs_angles() else []
+        angles = [] if self.meet else self._angles(moved)  # else they say where the body can be
         _, held = self._slid(turn, place, moved, angles)
         return jnp.concatenate([self._turn_equations(moved), held])
 
@@ -262,11 +262,6 @@ class Joints(Constraint):
         turned, back = self._about(hinges[1], angle) @ c, a @ self._about(hinges[1], angle)
         return [_angle_about(a, turned, moved @ c), angle, _angle_about(c, a @ moved, back)]
 
-    def _needs_angles(self) -> bool:
-        """Whether where the body can be hangs on how far the hinges have turned: if they do not meet, or a slide is
-        turned by one."""
-        return not self.meet
-
     def _turn_equations(self, moved) -> Float[Array, " e"]:
         """What holds the rotation: zero where the hinges alone have turned the body."""
         hinges = self._of("hinge")
@@ -282,7 +277,7 @@ class Joints(Constraint):
 
     def _slid(self, turn, place, moved, angles) -> tuple[list[Float[Array, ""]], Float[Array, " e"]]:
         """Amounts of the slides, and what is left of the way from rest that these are not: zero where joints hold."""
-        own, ways, free = self.rotation, [], None
+        own, ways = self.rotation, []
         if self.meet:
             anchor = self.anchors[0] if len(self.kinds) else jnp.zeros_like(self.place)
             left = place + turn @ anchor - self.place
@@ -358,11 +353,8 @@ class Coupling(Constraint):
     @classmethod
     def of(cls, joints: Sequence[Joints], first, second, coefficients, zeros=(0.0, 0.0)) -> "Coupling":
         """The same with all joints of a system, of which those that it does not hang on are left out."""
-        ends = np.cumsum([joint.count for joint in joints])
-        spans = [slice(end - joint.count, end) for joint, end in zip(joints, ends, strict=True)]
-        used = [k for k, at in enumerate(spans) if np.any(np.asarray(first)[at]) or np.any(np.asarray(second)[at])]
-        rows = [np.concatenate([np.asarray(row)[spans[k]] for k in used]) for row in (first, second)]
-        return cls([joints[k] for k in used], rows[0], rows[1], coefficients, zeros)
+        used, rows = those_of(joints, np.stack([first, second]))
+        return cls(used, rows[0], rows[1], coefficients, zeros)
 
     def __call__(self, x):
         q = jnp.concatenate([joint.coordinates(x) for joint in self.joints])
@@ -377,6 +369,13 @@ class Coupling(Constraint):
 
     def size(self, length):
         return jnp.ones_like(length)
+
+
+def those_of(joints: Sequence[Joints], rows: Float[np.ndarray, "r q"]) -> tuple[list[Joints], Float[np.ndarray, "r p"]]:
+    """Those of some joints that rows over the coordinates of all of them have a part in, and the rows over theirs."""
+    parts = np.split(rows, np.cumsum([joint.count for joint in joints])[:-1], axis=1)
+    used = [k for k, part in enumerate(parts) if part.any()]
+    return [joints[k] for k in used], np.concatenate([parts[k] for k in used], axis=1)
 
 
 def _check_kinds(kinds: Sequence[str], d: int, j: int | None) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from carom.mechanics.forces import Force, InertiaBoxFluid, JointDamping, JointSpring, PointForce, Rotors
 from carom.mjcf.bodies import Group, is_off, tendon_gears
 
-BALL, HINGE, SLIDE = 1, 3, 2  # mjtJoint
+BALL, SLIDE = 1, 2  # mjtJoint
 
 
 def springs_of(mujoco: Any, model: Any) -> list[Force]:

@@ -6,10 +6,10 @@ import numpy as np
 
 from carom.contact.candidates import Contact
 from carom.contact.joint_limits import DryFriction, JointLimit
-from carom.mechanics.joints import Joints
+from carom.mechanics.joints import Joints, those_of
 from carom.mjcf.bodies import is_off, name_of, tendon_gears
 
-BALL, SLIDE = 1, 2  # mjtJoint
+BALL = 1  # mjtJoint
 
 
 def limits_of(mujoco: Any, model: Any, joints: list[Joints], property: int) -> list[Contact]:
@@ -41,12 +41,20 @@ def limits_of(mujoco: Any, model: Any, joints: list[Joints], property: int) -> l
     gears = tendon_gears(model)
     for k in np.flatnonzero(np.asarray(model.tendon_limited, bool)):
         if gears[k].any():
-            used, row = _used(joints, gears[k])
+            used, row = those_of(joints, gears[k][None])
             low, high = (float(bound) for bound in model.tendon_range[k])
             name = name_of(model, "tendon", int(k)).replace("'", "")
             names = [f"{name} lower limit", f"{name} upper limit"]
             found.append(
-                JointLimit(used, [row, row], [low, high], [1, -1], float(model.tendon_margin[k]), property, names)
+                JointLimit(
+                    used,
+                    np.repeat(row, 2, axis=0),
+                    [low, high],
+                    [1, -1],
+                    float(model.tendon_margin[k]),
+                    property,
+                    names,
+                )
             )
     return found
 
@@ -66,17 +74,7 @@ def dry_friction_of(mujoco: Any, model: Any, joints: list[Joints], property: int
             found.append(DryFriction(joint, np.eye(joint.count)[there], loss[there], property, names))
     gears = tendon_gears(model)
     for k in np.flatnonzero(model.tendon_frictionloss):
-        used, row = _used(joints, gears[k])
+        used, row = those_of(joints, gears[k][None])
         name = name_of(model, "tendon", int(k)).replace("'", "")
-        found.append(
-            DryFriction(used, row[None], [float(model.tendon_frictionloss[k])], property, [f"{name} dry friction"])
-        )
+        found.append(DryFriction(used, row, [float(model.tendon_frictionloss[k])], property, [f"{name} dry friction"]))
     return found
-
-
-def _used(joints: list[Joints], gears: np.ndarray) -> tuple[list[Joints], np.ndarray]:
-    """The joints that a row of gears has a part in, and the row over their coordinates."""
-    ends = np.cumsum([joint.count for joint in joints])
-    spans = [slice(end - joint.count, end) for joint, end in zip(joints, ends, strict=True)]
-    used = [k for k, span in enumerate(spans) if gears[span].any()]
-    return [joints[k] for k in used], np.concatenate([gears[spans[k]] for k in used])
